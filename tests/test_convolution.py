@@ -1,8 +1,7 @@
 """Convolution with a measured PSF, its ADMM, and the deconvolution of images that SciPy convolved."""
 
 import inspect
-import math
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from gs_jax import ADMM, FISTA, InputError, RichardsonLucy
 from gs_jax.__main__ import commands
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.provenance import read_provenance
-from gs_jax.projection.measured_psf import ConvolutionOperator
+from gs_jax.projection.measured_psf import ConvolutionOperator, middle, scene_size
 from gs_jax.reconstruction.deconvolution import deconvolve
 from gs_jax.solvers.base import RESULTS, differences, solve, total_variation
 from gs_jax.solvers.convolution import ConvolutionADMM
@@ -25,61 +24,78 @@ from gs_jax.solvers.convolution import ConvolutionADMM
 SIZES = [((3, 4, 7), (11, 16)), ((2, 12, 15), (9, 10))]
 
 
-def random_system(psf_shape, image_shape, dtype=jnp.float64):
-    psf = jax.random.uniform(jax.random.key(0), psf_shape, dtype)
-    convolution = ConvolutionOperator(psf, image_shape)
-    return psf, convolution, jax.random.normal(jax.random.key(1), convolution.scene_shape, dtype)
+def random_system(psf_shape, image_shape, dtype=np.float64):
+    """A PSF, a scene and an image."""
+    rng = np.random.default_rng(0)
+    shapes = psf_shape, (psf_shape[0], *scene_size(image_shape, psf_shape[1:])), image_shape
+    psf, scene, image = (rng.normal(size=shape).astype(dtype) for shape in shapes)
+    return abs(psf), scene, image
+
+
+@jax.jit
+def image_and_scene(psf, scene, image):
+    """A scene's image, and an image's scene by the adjoint."""
+    convolution = ConvolutionOperator(psf, image.shape)
+    assert convolution.scene_shape == scene.shape
+    return convolution.mv(scene), convolution.T.mv(image)
 
 
 @pytest.mark.parametrize("sizes", SIZES)
 def test_it_is_the_middle_of_scipys_linear_convolution(sizes):
-    psf, convolution, scene = random_system(*sizes)
-    expected = 0
-    for kernel, plane in zip(np.asarray(psf), np.asarray(scene), strict=True):
-        full = convolve2d(plane, kernel)
-        middle = [slice(k // 2, k // 2 + n) for k, n in zip(kernel.shape, plane.shape, strict=True)]
-        expected = expected + full[*middle][convolution.window]
-    np.testing.assert_allclose(convolution.mv(scene), expected, atol=1e-12)
+    psf, scene, image = random_system(*sizes)
+    expected, window = 0, middle(image.shape, scene.shape[1:])
+    for kernel, plane in zip(psf, scene, strict=True):
+        inner = [slice(k // 2, k // 2 + n) for k, n in zip(kernel.shape, plane.shape, strict=True)]
+        expected = expected + convolve2d(plane, kernel)[*inner][window]
+    ours, light = image_and_scene(psf, scene, np.ones(image.shape))
+    np.testing.assert_allclose(ours, expected, atol=1e-12)
     # The scene is large enough: in front of the image's corners the whole PSF fits.
-    light = convolution.T.mv(jnp.ones(convolution.image_shape))
-    np.testing.assert_allclose(light.sum(), float(psf.sum()) * math.prod(convolution.image_shape), rtol=1e-12)
+    np.testing.assert_allclose(light.sum(), psf.sum() * image.size, rtol=1e-12)
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 2e-6)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 2e-6)])
 def test_adjoint(sizes, dtype, tolerance):
-    _, convolution, scene = random_system(*sizes, dtype=dtype)
-    A = convolution
-    image = jax.random.normal(jax.random.key(2), convolution.image_shape, dtype)
-    forth, back = jnp.vdot(A.mv(scene), image), jnp.vdot(scene, A.T.mv(image))
+    psf, scene, image = random_system(*sizes, dtype=dtype)
+    forth, back = map(np.asarray, image_and_scene(psf, scene, image))
     # Relative to the norms: the product itself may be near zero.
-    size = float(jnp.linalg.norm(A.mv(scene)) * jnp.linalg.norm(image))
-    np.testing.assert_allclose(forth, back, atol=tolerance * size)
+    size = float(np.linalg.norm(forth) * np.linalg.norm(image))
+    np.testing.assert_allclose(np.vdot(forth, image), np.vdot(scene, back), atol=tolerance * size)
 
 
 def test_gradients_of_the_image():
-    psf, _, scene = random_system((2, 4, 5), (6, 7))
+    psf, scene, image = random_system((2, 4, 5), (6, 7))
+    forward = jax.jit(lambda psf, x: ConvolutionOperator(psf, image.shape).mv(x))
     # Bilinear: central differences of first order are exact but for rounding.
-    check_grads(
-        lambda psf, x: ConvolutionOperator(psf, (6, 7)).mv(x), (psf, scene), order=1, eps=1e-2, atol=1e-8, rtol=1e-8
-    )
+    check_grads(forward, (psf, scene), order=1, eps=1e-2, atol=1e-8, rtol=1e-8)
     with pytest.raises(InputError, match=r"\(depth, row, column\) and not empty, got the shape \(0, 3, 3\)"):
-        ConvolutionOperator(jnp.zeros((0, 3, 3)), (5, 5))
+        ConvolutionOperator(np.zeros((0, 3, 3)), (5, 5))
+
+
+_operator = jax.jit(ConvolutionOperator, static_argnums=1)
+_image_of = jax.jit(ConvolutionOperator.mv)
+_scene_of = jax.jit(lambda convolution, image: convolution.T.mv(image))
+
+
+def noisy_psf(depths=1):
+    return np.random.default_rng(0).random((depths, 5, 4))
 
 
 def noisy_system(depths=1):
-    psf = jax.random.uniform(jax.random.key(0), (depths, 5, 4))
-    convolution = ConvolutionOperator(psf, (12, 10))
-    scene = jnp.zeros(convolution.scene_shape).at[0, 5:8, 4:7].set(1.0).at[-1, 9, 9].set(2.0)
-    return convolution, convolution.mv(scene) + 0.2 * jax.random.normal(jax.random.key(1), convolution.image_shape)
+    convolution = _operator(noisy_psf(depths), (12, 10))
+    scene = np.zeros(convolution.scene_shape)
+    scene[0, 5:8, 4:7], scene[-1, 9, 9] = 1.0, 2.0
+    noise = np.random.default_rng(1).normal(size=convolution.image_shape)
+    return convolution, np.asarray(_image_of(convolution, scene)) + 0.2 * noise
 
 
 def relative(convolution, image, **weights):
     """Options of a solver, whose unit of weights is the largest voxel of the adjoint's scene."""
-    unit = convolution.T.mv(image).max()
+    unit = np.asarray(_scene_of(convolution, image)).max()
     return {name: weight / unit for name, weight in weights.items()}
 
 
+@partial(jax.jit, static_argnames="isotropic")
 def objective(convolution, image, x, *, tv, l1, isotropic=False):
     residual = convolution.mv(x) - image
     u = differences(x, wrap=True)
@@ -124,8 +140,7 @@ def numpy_admm(psf, image, steps, tv, l1, penalties=(1.0, 1.0, 1.0)):
 @pytest.mark.integration
 def test_the_cost_is_that_of_a_plain_numpy_version():
     convolution, image = noisy_system()
-    psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))
-    x, expected = numpy_admm(np.asarray(psf[0]), np.asarray(image), 4000, 0.05, 0.1)
+    x, expected = numpy_admm(noisy_psf()[0], image, 4000, 0.05, 0.1)
     solution = solve(convolution, image, ConvolutionADMM(4000, **relative(convolution, image, tv=0.05, sparsity=0.1)))
     np.testing.assert_allclose(objective(convolution, image, solution.value, tv=0.05, l1=0.1), expected, rtol=1e-8)
     np.testing.assert_allclose(solution.stats["costs"][-1], expected, rtol=1e-8)
@@ -163,7 +178,7 @@ def test_total_variation_is_at_its_minimum(isotropic, depths):
     convolution, image = noisy_system(depths)
     solution = minimum(depths, isotropic)
     cost = lambda x: float(objective(convolution, image, x, tv=0.05, l1=0.02, isotropic=isotropic))
-    noise = jax.random.normal(jax.random.key(3), (10, *solution.value.shape))
+    noise = np.random.default_rng(3).normal(size=(10, *solution.value.shape))
     others = [solution.value * 0.99, minimum(depths, not isotropic).value]
     others += [jnp.maximum(solution.value + 1e-3 * n, 0) for n in noise]
     assert min(map(cost, others)) > cost(solution.value)
@@ -185,15 +200,14 @@ def test_the_penalty_adapts_and_the_residuals_stop_it():
 @pytest.mark.integration
 def test_gradients_of_the_solution():
     convolution, image = noisy_system()
-    psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))
-    weight = jax.random.normal(jax.random.key(7), convolution.scene_shape)
+    psf, weight = noisy_psf(), np.random.default_rng(7).normal(size=convolution.scene_shape)
 
     def moment(psf, image, tv):
         system = ConvolutionOperator(psf, image.shape)
         return jnp.vdot(weight, solve(system, image, ConvolutionADMM(4, tv=tv, isotropic=True)).value)
 
     # Away from the kinks of soft thresholding at this generic point.
-    tv = jnp.asarray(relative(convolution, image, tv=0.05)["tv"])
+    tv = relative(convolution, image, tv=0.05)["tv"]
     check_grads(jax.jit(moment), (psf, image, tv), order=1, eps=1e-7, atol=1e-5, rtol=1e-5)
 
 
@@ -212,15 +226,17 @@ def test_low_frequencies_do_not_outweigh_the_regularizer():
 
     LenslessPiCam's constant penalties, too, are beaten by far after so few steps.
     """
-    psf = jax.random.uniform(jax.random.key(0), (1, 32, 30))
-    psf = psf / jnp.linalg.norm(psf)
-    convolution = ConvolutionOperator(psf, (32, 30))
-    image = convolution.mv(jnp.zeros(convolution.scene_shape).at[0, 20:40, 18:40].set(1.0))
-    image = image / jnp.linalg.norm(image)
-    x = solve(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).value
+    psf = np.random.default_rng(0).random((1, 32, 30))
+    psf = psf / np.linalg.norm(psf)
+    convolution = _operator(psf, (32, 30))
+    scene = np.zeros(convolution.scene_shape)
+    scene[0, 20:40, 18:40] = 1.0
+    image = np.asarray(_image_of(convolution, scene))
+    image = image / np.linalg.norm(image)
+    x = solve(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).x
     cost = objective(convolution, image, x, tv=1e-4, l1=0.0)
     for penalties in ((1.0, 1.0, 1.0), (1e-6, 1e-5, 4e-5)):
-        assert 4 * cost < numpy_admm(np.asarray(psf[0]), np.asarray(image), 20, 1e-4, 0.0, penalties)[1]
+        assert 4 * cost < numpy_admm(psf[0], image, 20, 1e-4, 0.0, penalties)[1]
 
 
 def bars() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -230,7 +246,8 @@ def bars() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     scene[20:40, 20:24], scene[20:40, 34:38], scene[10:14, 30:60] = 1, 2, 1.5
     psf[tuple(rng.integers(4, 37, (2, 7)))] = 1
     psf = fftconvolve(psf, np.outer(np.hanning(5), np.hanning(5)), mode="same").clip(0)
-    return scene, psf, 100 + 1000 * fftconvolve(scene, psf / psf.sum(), mode="same").clip(0)
+    image = 100 + 1000 * fftconvolve(scene, psf / psf.sum(), mode="same").clip(0)
+    return scene, psf.astype(np.float32), image.astype(np.float32)
 
 
 SOLVERS = [ConvolutionADMM(80, sparsity=0.0, tv=1e-4), FISTA(80, sparsity=0.0), RichardsonLucy(80, accelerate=True)]
@@ -259,13 +276,13 @@ def test_wrong_input_of_deconvolution_is_named():
         deconvolve(image[:20, :60], psf)
     with pytest.raises(InputError, match=r"no light above the darkest percent in plane 2\."):
         deconvolve(image, np.stack([psf, 0 * psf]))
-    assert not deconvolve(np.zeros((50, 50)), psf).any()
+    assert not deconvolve(np.zeros_like(image), psf).any()
 
 
 def test_the_deconvolve_command(tmp_path):
     _, psf, image = bars()
-    write_capture(tmp_path / "c.tif", image.astype(np.float32))
-    write_capture(tmp_path / "psf.npy", psf.astype(np.float32))
+    write_capture(tmp_path / "c.tif", image)
+    write_capture(tmp_path / "psf.npy", psf)
     arguments = ["deconvolve", str(tmp_path / "c.tif"), str(tmp_path / "psf.npy"), "--steps", "5"]
     output = ["-o", str(tmp_path / "s.tif")]
     assert CliRunner().invoke(commands, arguments + output).exit_code == 0
@@ -277,8 +294,8 @@ def test_the_deconvolve_command(tmp_path):
 
 def test_the_command_says_how_well_the_scene_was_found(tmp_path):
     scene, psf, image = bars()
-    write_capture(tmp_path / "c.tif", image.astype(np.float32))
-    write_capture(tmp_path / "psf.tif", psf.astype(np.float32))
+    write_capture(tmp_path / "c.tif", image)
+    write_capture(tmp_path / "psf.tif", psf)
 
     def run(*options):
         paths = [str(tmp_path / name) for name in ("c.tif", "psf.tif", "s.tif")]
