@@ -38,7 +38,7 @@ def test_areas_add_up_to_the_exact_coverage(count, seed, diameter):
     centers = np.concatenate([centers, np.tile(centers[:1], (64 - count, 1))])
     lenses = array(centers, diameter=diameter)
     # Copies of a lens do not bound each other, so they count once here.
-    total = float(aperture_area(lenses)[:count].sum())
+    total = float(np.asarray(aperture_area(lenses))[:count].sum())
     # Qhull joins vertices closer than 1e-8 or so.
     np.testing.assert_allclose(total / 48, coverage(centers[:count], (8.0, 6.0), diameter=diameter), rtol=1e-7)
 
@@ -61,11 +61,12 @@ def test_a_compiled_lens_does_not_bound_itself(scale):
     """Compilers that optimise fuse the product into the difference of centres: not 0 of a lens and itself."""
     lenses = array([[-1.313, 0.437], [0.221, 0.119], [1.127, -0.741], [0.333, 1.416], [-0.629, -1.243]], diameter=1.1)
     areas = lambda scale: aperture_area(dataclasses.replace(lenses, centers=scale * lenses.centers))
-    np.testing.assert_allclose(jax.jit(areas)(jnp.array(scale)), areas(jnp.array(scale)), rtol=1e-9)
+    alone = aperture_area(dataclasses.replace(lenses, centers=scale * np.asarray(lenses.centers)))
+    np.testing.assert_allclose(jax.jit(areas)(np.array(scale)), alone, rtol=1e-9)
 
 
 def test_area_is_the_integral_of_the_edge():
-    lenses, count = array(layout(32)), 4096
+    lenses, count = array(layout(64)), 4096
     angles = (np.arange(count) + 0.5) * (2 * np.pi / count)
     integral = np.sum(aperture_edge(lenses, angles) ** 2, axis=1) * np.pi / count
     # The midpoint rule at corners, and at jumps where a lens is close to the plate's edge.
@@ -100,7 +101,7 @@ def test_closed_forms_and_degenerate_layouts(lenses, expected):
 def test_a_lens_on_the_plates_edge_feels_it():
     """Half of the disc is cut off; moving in by dx gains a strip of 2 dx."""
     one = lambda x: aperture_area(array(jnp.stack([x, jnp.zeros(())])[None]))[0]
-    np.testing.assert_allclose(jax.grad(one)(jnp.array(4.0)), -2.0, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.grad(one))(4.0), -2.0, rtol=1e-12)
 
 
 def test_a_regular_array():
@@ -108,9 +109,9 @@ def test_a_regular_array():
     centers = np.stack([x.ravel(), y.ravel()], axis=1)
     np.testing.assert_allclose(aperture_area(array(centers, (11.0, 11.0))), 1, rtol=1e-13)
     np.testing.assert_allclose(clear_diameter(array(centers, (11.0, 11.0))), 2 / np.sqrt(np.pi), rtol=1e-13)
-    mean, deviation = pitch(jnp.asarray(centers))
+    mean, deviation = pitch(centers)
     assert (mean, deviation) == (1, 0)
-    assert jnp.all(jnp.isfinite(jax.grad(lambda c: pitch(c)[1])(jnp.asarray(centers))))
+    assert np.isfinite(jax.jit(jax.grad(lambda c: pitch(c)[1]))(centers)).all()
 
 
 @pytest.mark.parametrize("angle", [0.3, np.pi / 4])
@@ -120,9 +121,9 @@ def test_float32_and_rounding(angle):
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     centers = np.stack([x.ravel(), y.ravel()], axis=1) @ turn
     inner = np.hypot(*centers.T) < 4
-    for dtype, tolerance in [(jnp.float64, 1e-12), (jnp.float32, 1e-5)]:
-        lenses = jax.tree.map(lambda leaf: leaf.astype(dtype), MicrolensArray(centers))  # noqa: B023
-        area = aperture_area(lenses)
+    for dtype, tolerance in [(np.float64, 1e-12), (np.float32, 1e-5)]:
+        lenses = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), MicrolensArray(centers))  # noqa: B023
+        area = np.asarray(aperture_area(lenses))
         assert area.dtype == dtype
         np.testing.assert_allclose(area[inner], 1, rtol=tolerance)
 
@@ -142,14 +143,14 @@ def test_gradients(size):
 def test_pitch_is_the_mean_distance_to_the_nearest():
     centers = layout(213)
     expected = nearest_neighbour_distances(centers)
-    mean, deviation = pitch(jnp.asarray(centers))
+    mean, deviation = pitch(centers)
     np.testing.assert_allclose([mean, deviation], [expected.mean(), expected.std()], rtol=1e-13)
 
 
 def test_pitch_of_one_lens_and_of_coincident_lenses():
-    assert pitch(jnp.zeros((1, 2))) == (jnp.inf, 0)
-    assert pitch(jnp.zeros((3, 2))) == (0, 0)
-    assert jnp.all(jax.grad(lambda c: sum(pitch(c)))(jnp.zeros((3, 2))) == 0)
+    assert pitch(np.zeros((1, 2))) == (np.inf, 0)
+    value, slope = jax.jit(jax.value_and_grad(lambda c: sum(pitch(c))))(np.zeros((3, 2)))
+    assert value == 0 and not slope.any()
 
 
 @pytest.mark.integration
@@ -190,7 +191,8 @@ def test_two_spheres_meet_in_a_circle():
     with np.errstate(invalid="ignore"):
         roots = (-q + np.sqrt(q**2 - 4 * p * s) * [[-1], [1]]) / (2 * p)
     roots = np.where((roots > 0) & (b * roots >= a), roots, np.inf)
-    np.testing.assert_allclose(_edge_distances(array, 512)[0], np.minimum(roots.min(0), 1.0), rtol=1e-9)
+    edges = jax.jit(_edge_distances, static_argnums=1)(array, 512)
+    np.testing.assert_allclose(np.asarray(edges)[0], np.minimum(roots.min(0), 1.0), rtol=1e-9)
 
 
 def test_alike_lenses_end_at_their_cells():
@@ -202,13 +204,13 @@ def test_alike_lenses_end_at_their_cells():
 
 def test_lenses_that_are_apart_are_discs_on_the_plate():
     """What the plate cuts off them is a segment; where they overlap by 1 um they are nearly that."""
-    centers, diameters = jnp.array([[-0.75, 0.0], [0.6, 0.1]]), jnp.array([0.9, 1.0])
+    centers, diameters = np.array([[-0.75, 0.0], [0.6, 0.1]]), np.array([0.9, 1.0])
     array = MicrolensArray(centers, radius_of_curvature=[2.0, 1.7], aperture_diameter=diameters, size=(2.0, 3.0))
     full, segment = np.pi / 4 * diameters**2, []
     for room, radius in ((0.25, 0.45), (0.4, 0.5)):
         segment.append(radius**2 * np.arccos(room / radius) - room * np.sqrt(radius**2 - room**2))
     np.testing.assert_allclose(aperture_area(array), full - np.array(segment), rtol=5e-5)
-    near = [dataclasses.replace(array, centers=centers.at[1, 0].set(x)) for x in (0.195, 0.194)]  # apart, and not
+    near = [dataclasses.replace(array, centers=[[-0.75, 0.0], [x, 0.1]]) for x in (0.195, 0.194)]  # apart, and not
     np.testing.assert_allclose(aperture_area(near[0]), aperture_area(near[1]), rtol=1e-3)
 
 
@@ -233,7 +235,7 @@ def test_a_kind_keeps_its_neighbours():
     parts = [array.subset(type_) for type_ in which]
     assert all(part.alike and len(part.centers) == 3 and len(part.whole.centers) == 9 for part in parts)
     areas = np.concatenate([aperture_area(part) for part in parts])
-    np.testing.assert_allclose(areas, aperture_area(array)[np.concatenate(which)], rtol=1e-12)
+    np.testing.assert_allclose(areas, np.asarray(aperture_area(array))[np.concatenate(which)], rtol=1e-12)
 
 
 @pytest.mark.integration
@@ -275,4 +277,5 @@ def test_gradients_of_areas_of_lenses_that_differ(size):
 def test_clear_areas_are_of_the_arrays_precision():
     array = MicrolensArray([[0.0, 0.0], [1.2, 0.1]])
     for dtype in (np.float32, np.float64):
-        assert clear_area(jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), array)).dtype == dtype
+        own = jax.tree.map(lambda leaf, dtype=dtype: jax.device_put(np.asarray(leaf, dtype)), array)
+        assert clear_area(own).dtype == dtype

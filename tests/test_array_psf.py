@@ -7,17 +7,15 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.codesign.array_psf import (
-    array_spectrum,
-    condition_number,
-    crosstalk,
-    mean_inverse_views,
-    sidelobes,
-    spectral_flatness,
-)
+from gs_jax.codesign import array_psf
 from gs_jax.geometry import envelope
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout
 
+# One program each instead of one for each of their operations.
+array_spectrum, crosstalk, mean_inverse_views, sidelobes = map(
+    jax.jit, (array_psf.array_spectrum, array_psf.crosstalk, array_psf.mean_inverse_views, array_psf.sidelobes)
+)
+condition_number, spectral_flatness = map(jax.jit, (array_psf.condition_number, array_psf.spectral_flatness))
 SOURCES = np.array([[0.1, -0.2, 20.0], [0.3, 0.4, 18.0]])
 WIDTH = 0.02
 OWN: dict[str, Any] = dict(lateral=0.1, axial=1.0)

@@ -48,6 +48,7 @@ from gs_jax.io.provenance import read_provenance
 from gs_jax.layers import reduced_distance
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type
+from gs_jax.optics.raytrace import to_numpy
 
 from .helpers import needs
 
@@ -74,12 +75,13 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     Computed in the plate's frame and rotated into the sensor's, so that the tilt is exact. Plate and filters are
     optically thinner along its normal, and a sample with a surface of its own along the sensor's.
     """
+    imager = to_numpy(imager)
     array, sample = imager.array, imager.sample
     thickness = float(array.substrate_thickness)
     thinner = thickness * (1 - 1 / float(array.refractive_index))
     in_front, behind = (thickness, 0.0) if array.orientation == "plano" else (0.0, thinner)
     filters = 0.0 if imager.filters is None else float(imager.filters.shortening)
-    in_sample = 0.0 if sample is None else point[2] - float(reduced_distance(jnp.asarray(point[2]), None, sample))
+    in_sample = 0.0 if sample is None else point[2] - float(reduced_distance(np.asarray(point[2]), None, sample))
     tilt = np.zeros(2) if imager.tilt is None else np.asarray(imager.tilt)
     steepest = np.append(tilt, 0) / max(np.linalg.norm(tilt), 1e-12)
     turn = Rotation.from_rotvec(np.arctan(np.linalg.norm(tilt)) * np.cross(steepest, [0, 0, 1]))
@@ -87,14 +89,14 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     v = float(imager.reduced_sensor_distance)
     source = turn.inv().apply([*point[:2], point[2] - in_sample + in_front])
     source[2] -= filters + (thinner if in_front else 0)
-    centers = np.asarray(level.centers)
+    centers = level.centers
     beside = source[:2] - centers
     field = np.hypot(*beside.T)
     order = np.argsort(field)[: int(0.9 * len(field))]
     order = order[field[order] < 1.1 * imager.field_radius][1:]
     centers, beside, field = centers[order], beside[order], field[order]
     some = np.linspace(0, 1.1 * imager.field_radius, 13)
-    depth = np.asarray(level.depth_of(jnp.asarray(source[2:])))
+    depth = level.depth_of(source[2:])
     types = split_by_type(level, lenses_by_type(level.array))
     offsets = [np.interp(field, some, core_offsets(one, depth, some)[0]) for one in types]
     offset = np.choose(np.asarray(level.array.type_of_lens)[order], offsets)
@@ -104,7 +106,7 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     # Behind a plate the light goes on as from farther along its normal.
     vertices = vertices - behind * turn.apply([0, 0, 1])
     onward = onward[:, :2] * ((v + behind + vertices[:, 2]) / -onward[:, 2])[:, None]
-    return np.asarray(imager.sensor.to_pixels(vertices[:, :2] + onward))
+    return imager.sensor.to_pixels(vertices[:, :2] + onward)
 
 
 def captures(imager: Imager, points=POINTS, of=None) -> list[np.ndarray]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -11,6 +10,7 @@ import gs_jax as gs
 from experiments.calibration import device
 from gs_jax.__main__ import commands
 from gs_jax.calibration.fit import calibrate, self_calibrate
+from gs_jax.optics.raytrace import to_numpy
 
 from .test_calibration import MANY, captures, check
 
@@ -26,9 +26,9 @@ def layered(kind: str) -> tuple[gs.Imager, gs.Imager]:
     filters = gs.Layers([0.3, 2.0], [1.0, 1.52]) if kind == "curved" else FILTER
     actual = dataclasses.replace(actual, array=array, filters=filters, windows=WINDOW)
     # In focus, as without layers.
-    actual = dataclasses.replace(actual, sensor_distance=actual.sensor_distance_of(jnp.asarray(5.8)))
+    actual = dataclasses.replace(actual, sensor_distance=to_numpy(actual).sensor_distance_of(5.8))
     array = dataclasses.replace(array, centers=design.array.centers)
-    moved = {"sensor_distance": 1.03 * actual.sensor_distance, "rotation": 0.0, "shift": (0.0, 0.0), "tilt": None}
+    moved = {"sensor_distance": 1.03 * float(actual.sensor_distance), "rotation": 0.0, "shift": (0.0, 0.0), "tilt": None}
     return actual, dataclasses.replace(actual, array=array, **moved)
 
 
