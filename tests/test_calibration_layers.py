@@ -28,7 +28,12 @@ def layered(kind: str) -> tuple[gs.Imager, gs.Imager]:
     # In focus, as without layers.
     actual = dataclasses.replace(actual, sensor_distance=to_numpy(actual).sensor_distance_of(5.8))
     array = dataclasses.replace(array, centers=design.array.centers)
-    moved = {"sensor_distance": 1.03 * float(actual.sensor_distance), "rotation": 0.0, "shift": (0.0, 0.0), "tilt": None}
+    moved = {
+        "sensor_distance": 1.03 * float(actual.sensor_distance),
+        "rotation": 0.0,
+        "shift": (0.0, 0.0),
+        "tilt": None,
+    }
     return actual, dataclasses.replace(actual, array=array, **moved)
 
 

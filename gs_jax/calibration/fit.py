@@ -389,12 +389,13 @@ def spot_residuals(
 def _observations(imager: Imager, sources: Sources, unknown, spots: Spots, offsets: CoreOffsets) -> Observations:
     size = -(-max(len(spots.lenses), 1) // _MULTIPLE) * _MULTIPLE
     dtype = imager.sensor_distance.dtype
-    of, lenses, positions = (
-        jnp.asarray(np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)])) for part in spots[:3]
-    )
-    valid, unknown = jnp.arange(size) < len(spots.lenses), jnp.asarray(np.argwhere(unknown))
-    points, blur = jnp.asarray(sources.points, dtype), jnp.asarray(sources.blurs, dtype)[of]
-    return Observations(imager, points, unknown, of, lenses, positions.astype(dtype), valid, blur, offsets)
+    of, lenses, positions = (np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)]) for part in spots[:3])
+    points, blur = sources.points.astype(dtype), np.asarray(sources.blurs, dtype)[of]
+    valid, unknown = np.arange(size) < len(spots.lenses), np.argwhere(unknown)
+    # JAX would compile programs to make arrays of these shapes.
+    points, unknown, of, lenses = map(jax.device_put, (points, unknown, of, lenses))
+    positions, valid, blur = map(jax.device_put, (positions.astype(dtype), valid, blur))
+    return Observations(imager, points, unknown, of, lenses, positions, valid, blur, offsets)
 
 
 def self_calibrate(

@@ -281,11 +281,18 @@ def expose(
     """
     image = jnp.asarray(native(image))
     peak = jnp.asarray(peak_electrons, image.dtype)
-    _check_value("peak_electrons", peak, (peak > 0) & jnp.isfinite(peak), "positive and finite")
+    wrong, positive = _validity(image, peak)
+    _check_value("peak_electrons", peak, positive, "positive and finite")
+    _check_value("image", f"{wrong} pixels that are not", wrong == 0, "finite and not negative")
+    return _expose(image, camera, key, peak)
+
+
+@jax.jit
+def _validity(image, peak):
+    """Number of pixels that are negative or not finite, and whether the peak is positive and finite."""
     # Not `min` and `max`: they pass over a NaN on some devices.
     wrong = ~((image >= 0) & (image < jnp.inf))
-    _check_value("image", f"{wrong.sum()} pixels that are not", ~wrong.any(), "finite and not negative")
-    return _expose(image, camera, key, peak)
+    return wrong.sum(), (peak > 0) & jnp.isfinite(peak)
 
 
 @jax.jit
