@@ -20,6 +20,8 @@ SAMPLES = {
     "immersed": gs.Sample(1.33),
 }
 FIELD = (1.3, -2.1)
+# Of each trace, so that one program serves all of a structure.
+POINTS = 56
 
 
 def layered(orientation: Orientation = "plano", sample="gel", **numbers) -> gs.Imager:
@@ -129,23 +131,29 @@ def bend(direction, normal, cosine, ratio):
 @pytest.mark.parametrize("sample", SAMPLES)
 def test_rays_near_the_axis_go_by_reduced_distances(sample):
     scope = layered(sample=sample)
-    near = 1e-3 * np.array([[0.0, 0.0], [0.3, 0.1]])
+    near, host = np.resize(1e-3 * np.array([[0.0, 0.0], [0.3, 0.1]]), (POINTS, 2)), to_numpy(scope)
     landing = np.asarray(trace_lenslet(scope, 21.0, near, (2e-3, -1e-3)).landing)
-    np.testing.assert_allclose(landing[0], -scope.magnification(21.0) * np.array([2e-3, -1e-3]), rtol=1e-6)
-    assert float(scope.depth_of(scope.reduced_depth(21.0))) == pytest.approx(21.0)
-    assert float(scope.sensor_distance_of(scope.reduced_sensor_distance)) == pytest.approx(6.0)
-    focus = float(aberrations.best_focus(scope, 21.0, radius=0.05))
+    np.testing.assert_allclose(landing[0], -host.magnification(21.0) * np.array([2e-3, -1e-3]), rtol=1e-6)
+    assert float(host.depth_of(host.reduced_depth(21.0))) == pytest.approx(21.0)
+    assert float(host.sensor_distance_of(host.reduced_sensor_distance)) == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize(
+    "sample", ["gel", *(pytest.param(name, marks=pytest.mark.integration) for name in ("air", "immersed"))]
+)
+def test_the_best_focus_is_that_of_reduced_distances(sample):
+    scope = layered(sample=sample)
+    focus, scope = float(aberrations.best_focus(scope, 21.0, radius=0.05)), to_numpy(scope)
     vergence = 1 / scope.array.focal_length - 1 / scope.reduced_depth(21.0)
     assert float(scope.sensor_distance_of(1 / vergence)) == pytest.approx(focus, rel=1e-3)
 
 
 def test_layers_of_index_one_are_air():
-    scope = layered(sample="air")
-    air = dataclasses.replace(
-        scope, filters=gs.Layers([2.0], [1.0]), windows=None, sample=gs.Sample(1.0, 19.0, gs.Layers([0.17], [1.0]))
-    )
-    without = dataclasses.replace(air, filters=None, sample=None)
-    points = np.array([[0.1, 0.2], [-0.5, 0.4]])
+    # As many layers as of "gel".
+    layers = {"filters": gs.Layers([2.0], [1.0]), "windows": gs.Layers([0.6, 0.55], [1.0, 1.0])}
+    air = dataclasses.replace(layered(), **layers, sample=gs.Sample(1.0, 19.0, gs.Layers([0.17], [1.0])))
+    without = dataclasses.replace(air, filters=None, windows=None, sample=None)
+    points = np.resize(np.array([[0.1, 0.2], [-0.5, 0.4]]), (POINTS, 2))
     for one, other in zip(*(trace_lenslet(each, 21.0, points, FIELD) for each in (air, without)), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
     field, hosts = np.array(FIELD)[:, None], [to_numpy(each) for each in (air, without)]
