@@ -19,10 +19,9 @@ from pydantic import ValidationError
 
 from gs_jax import geomscope
 from gs_jax.base.errors import InputError, InputWarning
-from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design, read_design, write_design
 
-from .helpers import examples, needs
+from .helpers import examples, needs, quantities
 
 ROOT = Path(__file__).parents[1]
 DESIGNS = sorted(p for folder in ("design", "experiments/designs") for p in (ROOT / folder).glob("*.toml"))
@@ -475,8 +474,8 @@ def test_a_design_of_an_imager_says_what_is_sharp():
     design = geomscope()
     found = Design.from_imager(design.imager(), name="mine").imaging.working_distance_mm
     in_focus = 1 / (0.43 / 2.0 - 1 / 5.8) - 1.0 / 1.43
-    sheet = datasheet(design, [in_focus])
-    assert found == pytest.approx((sheet["near_limit_mm"][0], sheet["far_limit_mm"][0]), abs=2e-3)
+    limits = quantities(design.imager(), np.array([in_focus]), ("near_limit", "far_limit"))
+    assert found == pytest.approx([float(limits[name][0]) for name in ("near_limit", "far_limit")], abs=2e-3)
     with pytest.raises(InputError, match="working_distance_mm must be given .*: no depth is in focus"):
         Design.from_imager(design.replace(sensor_distance_mm=4.0).imager(), name="mine")
     endless = dataclasses.replace(design.imager().array, size=(math.inf, math.inf))

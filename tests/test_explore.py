@@ -128,8 +128,8 @@ def test_targets_and_assumptions_in_words(design):
     assert not any("ghosts" in each for each in sentences)
     wide = design.replace(radius_of_curvature_mm=0.35)
     values = complete_values(make_sliders(wide), {"radius_of_curvature_mm": 0.18})
-    result = evaluate_design(start_of(wide), values)
-    sentences = evaluation.find_violations(wide, None, start_of(wide), values, result)
+    result = evaluate_design(start_of(wide, STUDY), values, evaluation.live_terms(STUDY))
+    sentences = evaluation.find_violations(wide, None, start_of(wide, STUDY), values, result)
     assert "The aperture of 0.4 mm is wider than its sphere, which has 0.36 mm." in sentences
 
 

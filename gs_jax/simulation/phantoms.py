@@ -181,12 +181,17 @@ def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> F
     >>> print(round(float(volume.sum()), 3), int((volume > 0.2).sum()))
     1.0 4
     """
-    emitters = jnp.asarray(emitters, grid.depths.dtype)
-    if _surely_not((jnp.diff(grid.depths) > 0).all()):
-        raise ValueError(f"`grid.depths` must ascend, got {short_repr(grid.depths.tolist())}.")
-    if _surely_not((finite := jnp.isfinite(emitters).all(axis=1)).all()):
-        raise ValueError(f"`emitters` must be finite, got {emitters[jnp.argmin(finite)].tolist()}.")
-    return _rasterize(emitters, grid)
+    depths = grid.depths
+    if not isinstance(depths, Tracer) and not (np.diff(np.asarray(depths)) > 0).all():
+        raise ValueError(f"`grid.depths` must ascend, got {short_repr(depths.tolist())}.")
+    if isinstance(emitters, Tracer):
+        return _rasterize(emitters.astype(depths.dtype), grid)
+    emitters = np.asarray(emitters, depths.dtype)
+    if not (finite := np.isfinite(emitters).all(axis=1)).all():
+        raise ValueError(f"`emitters` must be finite, got {emitters[np.argmin(finite)].tolist()}.")
+    # Dark ones make it a power of two: scenes of about as many emitters share a program.
+    size = 1 << max(len(emitters) - 1, 0).bit_length()
+    return _rasterize(np.pad(emitters, [(0, size - len(emitters)), (0, 0)]), grid)
 
 
 @jax.jit
@@ -219,10 +224,6 @@ def _shares(index, size):
     below = jnp.clip(jnp.floor(index), 0, max(size - 2, 0))
     fraction, below = index - below, below.astype(jnp.int32)
     return (below, inside * (1 - fraction)), (below + 1, inside * fraction)
-
-
-def _surely_not(condition) -> bool:  # a traced condition has no value
-    return not isinstance(condition, Tracer) and not condition
 
 
 def _check_lengths(**lengths):
