@@ -233,7 +233,7 @@ def test_low_frequencies_do_not_outweigh_the_regularizer():
     scene[0, 20:40, 18:40] = 1.0
     image = np.asarray(_image_of(convolution, scene))
     image = image / np.linalg.norm(image)
-    x = solve(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).x
+    x = solve(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).value
     cost = objective(convolution, image, x, tv=1e-4, l1=0.0)
     for penalties in ((1.0, 1.0, 1.0), (1e-6, 1e-5, 4e-5)):
         assert 4 * cost < numpy_admm(psf[0], image, 20, 1e-4, 0.0, penalties)[1]

@@ -87,7 +87,7 @@ def test_a_source_between_the_measured_places_is_predicted():
         corner = np.array([part.start for part in fit.operator.window])
         scene, truth = np.zeros(fit.operator.scene_shape, np.float32), spots_at(row, column)
         scene[0, *(corner + MIDDLE + (row, column))] = 1.0
-        image, truth = (np.asarray(a) / np.sum(a) for a in (image_of(fit.operator, scene), truth))
+        image, truth = (np.asarray(a) / float(np.sum(a)) for a in (image_of(fit.operator, scene), truth))
         middle = np.roll(spots_at(0, 0), (row, column), (0, 1)) / spots_at(0, 0).sum()
         error, of_one = (np.linalg.norm(a - truth) / np.linalg.norm(truth) for a in (image, middle))
         assert error < 0.15, (row, column, error)
