@@ -24,6 +24,7 @@ from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
 from ...optics.psf import least_samples, spot_image
+from ...optics.raytrace import to_numpy
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
 _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)
@@ -239,11 +240,11 @@ def find_violations(
     sentences, numbers = [], evaluation.numbers
     if not all(np.isfinite(value).all() for value in (*numbers.values(), *evaluation.scalars.values())):
         sentences.append("Some numbers are not finite: rays do not get through this lens.")
-    array = moved_imager(start, values).array
+    array = to_numpy(moved_imager(start, values).array)
     too_wide = (array.conic_constant == 0) & (array.aperture_diameter > 2 * array.radius_of_curvature)
     if "radius_of_curvature_mm" in values and not design.lens.aspheric_terms and bool(too_wide.any()):
         aperture, sphere = (
-            float(jnp.broadcast_to(x, too_wide.shape)[too_wide].ravel()[0])
+            float(np.broadcast_to(x, too_wide.shape)[too_wide].ravel()[0])
             for x in (array.aperture_diameter, 2 * array.radius_of_curvature)
         )
         sentences.append(f"The aperture of {aperture:.3g} mm is wider than its sphere, which has {sphere:.3g} mm.")
