@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -30,7 +31,15 @@ def _as_plate(x):
 
 def _as_types(x):
     # An array on the host: JAX would compile a conversion for each number of lenses.
-    return x if x is None or isinstance(x, Array) else jnp.asarray(np.asarray(x))
+    return x if x is None or isinstance(x, Array) else jax.device_put(np.asarray(x))
+
+
+def _at(values, index):
+    """Some entries of an array; on the host if they are known, as JAX compiles programs to index each shape."""
+    if isinstance(values, Tracer) or isinstance(index, Tracer):
+        return values[index]
+    entries = np.asarray(values)[np.asarray(index)]
+    return entries if isinstance(values, np.ndarray) else jax.device_put(entries)
 
 
 class MicrolensArray(eqx.Module):
@@ -164,7 +173,7 @@ class MicrolensArray(eqx.Module):
     def of_lenses(self, name: str) -> Scalars:
         """A number of each lens `(lens,)`: its radius of curvature, aperture diameter, conic constant, ...."""
         value, xp = getattr(self, name), array_namespace(self.centers)
-        return value[self.type_of_lens] if value.ndim else xp.broadcast_to(value, len(self.centers))
+        return _at(value, self.type_of_lens) if value.ndim else xp.broadcast_to(value, len(self.centers))
 
     def check_alike(self) -> None:
         """Raise `InputError` unless all lenses are alike."""
@@ -174,7 +183,7 @@ class MicrolensArray(eqx.Module):
 
     def lens(self, index: int) -> "MicrolensArray":
         """One of the lenses alone, on the same plate."""
-        return self._alike(self.centers[index][None], self.type_of_lens[index])
+        return self._alike(_at(self.centers, [index]), _at(self.type_of_lens, index))
 
     def of_type(self, number: int) -> "MicrolensArray":
         """All lenses, with the numbers of one type."""
@@ -184,9 +193,9 @@ class MicrolensArray(eqx.Module):
         """Lenses that are alike, such as those of a type, as an array whose `others` are the rest."""
         which = np.array(which)
         rest = np.setdiff1d(np.arange(len(self.centers)), which)
-        numbers = {name: self.of_lenses(name)[rest] for name in self._own}
-        others = dataclasses.replace(self, centers=self.centers[rest], types=None, **numbers) if rest.size else None
-        return self._alike(self.centers[which], self.type_of_lens[which[0]], others)
+        numbers = {name: _at(self.of_lenses(name), rest) for name in self._own} | {"centers": _at(self.centers, rest)}
+        others = dataclasses.replace(self, types=None, **numbers) if rest.size else None
+        return self._alike(_at(self.centers, which), _at(self.type_of_lens, which[0]), others)
 
     @property
     def whole(self) -> "MicrolensArray":
@@ -205,7 +214,7 @@ class MicrolensArray(eqx.Module):
 
     def _alike(self, centers, number, others=None) -> "MicrolensArray":
         """Lenses of one type."""
-        numbers = {name: getattr(self, name)[number] for name in self._own}
+        numbers = {name: _at(getattr(self, name), number) for name in self._own}
         return dataclasses.replace(self, centers=centers, others=others, types=None, **numbers)
 
     @property

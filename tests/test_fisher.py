@@ -94,7 +94,9 @@ def test_more_light_and_more_lenses_are_better():
     four_fold = cramer_rao(POINT[None], random_imager(), **OPTIONS | dict(photons=4e6, read_noise=0.0, background=0.0))
     bright = cramer_rao(POINT[None], random_imager(), **OPTIONS | dict(photons=1e6, read_noise=0.0, background=0.0))
     np.testing.assert_allclose(bright / four_fold, 2, rtol=1e-6)
-    fewer = with_centers(random_imager(), random_imager().centers[:6])
+    # Three of nine lenses see nothing, so that the program is the same.
+    centers = np.where(np.arange(9)[:, None] < 6, np.asarray(random_imager().array.centers), 50.0)
+    fewer = with_centers(random_imager(), centers)
     assert (cramer_rao(POINT[None], fewer, **OPTIONS) > base).all()
 
 
@@ -139,7 +141,7 @@ def test_a_psf_that_follows_from_the_imager_has_a_gradient():
 
 
 def test_float32():
-    low = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), random_imager())
+    low = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf, np.float32)), random_imager())
     found = cramer_rao(POINT[None].astype(np.float32), low, **OPTIONS)
     assert found.dtype == jnp.float32
     # The inverse of a matrix of condition 1e2 to 1e3, once its diagonal is 1.
