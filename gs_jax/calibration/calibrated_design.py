@@ -86,8 +86,9 @@ def apply_calibration(
 
 def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:
     """Keys of `[lens]` with a number for each lens, by the fewest decimals that give the array's numbers."""
-    numbers = {key: np.asarray(getattr(array, name)) for key, name in zip(LENS_KEYS, EACH, strict=True)}
-    return {key: tuple(float(str(one)) for one in value) for key, value in numbers.items() if value.ndim}
+    numbers = {key: name for key, name in zip(LENS_KEYS, EACH, strict=True) if getattr(array, name).ndim}
+    lists = {key: np.asarray(array.of_lenses(name)) for key, name in numbers.items()}
+    return {key: tuple(float(str(value)) for value in values) for key, values in lists.items()}
 
 
 def summary_table(design: Design, result: Calibration, start: Imager) -> Table:
