@@ -64,7 +64,7 @@ def scene(dtype=jnp.float64, *, shape=(96, 80), voxels=(21, 17), depths=(18.0, 2
     centers = rng.uniform(-0.9, 0.9, (24, 2))
     imager = Imager(MicrolensArray(centers), Sensor(shape, 0.02), 5.8, 0.45, rotation=0.02, shift=(0.013, -0.007))
     grid = Grid(depths, voxels, pitch)
-    cast = lambda leaf: jax.device_put(np.asarray(leaf, dtype))
+    cast = lambda leaf: jax.device_put(np.array(leaf, dtype))
     return jax.tree.map(cast, imager), jax.tree.map(cast, grid)
 
 
