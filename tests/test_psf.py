@@ -20,7 +20,7 @@ SLOW_FIRST = [*(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[:2]
 
 def lenslet(v=5.8, dtype=jnp.float64, pitch=0.0045, **lens):
     imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((64, 64), pitch), v, 3.0)
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtype)), imager)
+    return jax.tree.map(lambda leaf: jax.device_put(np.array(leaf, dtype)), imager)
 
 
 def in_focus(**more):

@@ -26,7 +26,7 @@ SHAPES: list[dict] = [
 
 def lenslet(v=5.8, dtype=jnp.float64, **lens):
     imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((64, 64), 0.0045), v, 3.0)
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtype)), imager)
+    return jax.tree.map(lambda leaf: jax.device_put(np.array(leaf, dtype)), imager)
 
 
 def some_points(radius=0.9, count=40):

@@ -102,8 +102,8 @@ def as_float(x) -> Array:
     """Convert to an array of the default precision; a floating-point array of JAX keeps its own."""
     if isinstance(x, Array) and jnp.issubdtype(x.dtype, jnp.floating):
         return x
-    # Lists and numbers become an array on the host: JAX would compile a conversion for each shape.
-    return jnp.asarray(x if isinstance(x, Array) else np.asarray(x, float), dtype=float)
+    # JAX would compile a conversion for each shape. A copy, since JAX may share the memory of what it is given.
+    return jnp.asarray(x, dtype=float) if isinstance(x, Array) else jax.device_put(np.array(x, float))
 
 
 def as_pair(x) -> tuple[float, float]:
