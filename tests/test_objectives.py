@@ -1,4 +1,5 @@
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,9 +22,11 @@ from gs_jax.layouts import max_gap, nearest_neighbour_distances
 from gs_jax.objectives import Conditions
 from gs_jax.objectives.spot_sizes import _outermost_half
 from gs_jax.optics.psf import diffraction_psf
+from gs_jax.optics.raytrace import to_numpy
 
 # Off the raster of places, where a hole has a kink.
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))
+SIZES = ("fwhm_um", "rms_width_um", "half_light_radius_um")
 CONTINUOUS = [name for name, term in TERMS.items() if not term.random]
 
 
@@ -31,8 +34,14 @@ class Case(NamedTuple):
     imager: Imager
     at: Conditions
 
-    def term(self, name):
-        return TERMS[name].function(*self)
+    def terms(self, *names):
+        return map(np.asarray, some_terms(self, names))
+
+
+@partial(jax.jit, static_argnames="names")
+def some_terms(case, names):
+    """Terms by name, as one program for cases of one structure, whatever their numbers."""
+    return [TERMS[name].function(*case) for name in names]
 
 
 @jax.jit
@@ -78,28 +87,29 @@ def test_the_papers_metrics_are_those_of_the_datasheet(design, focused, terms):
 
 
 def test_focus_is_one_at_the_ends_and_zero_between(focused):
-    f = focused.imager.array.focal_length
-    at = lambda z: eqx.tree_at(
-        lambda c: c.imager.sensor_distance, focused, 1 / (1 / f - 1 / focused.imager.reduced_depth(z))
-    )
-    near, far = focused.imager.reduced_depth(focused.at.depths)[jnp.array([0, -1])]
-    middle = 2 * near * far / (near + far) - focused.imager.reduced_depth(0.0)
-    offset = lambda c: c.term("focus_offset")
-    np.testing.assert_allclose([offset(at(18.0)), offset(at(23.0)), offset(at(middle))], [1, 1, 0], atol=1e-9)
+    host = to_numpy(focused.imager)
+    f, (near, far) = host.array.focal_length, host.reduced_depth(np.array([18.0, 23.0]))
+    middle = 2 * near * far / (near + far) - host.reduced_depth(0.0)
+    distance = lambda z: 1 / (1 / f - 1 / host.reduced_depth(z))
+
+    def offset(sensor_distance):
+        return float(*eqx.tree_at(lambda c: c.imager.sensor_distance, focused, sensor_distance).terms("focus_offset"))
+
+    np.testing.assert_allclose([offset(distance(z)) for z in (18.0, 23.0, middle)], [1, 1, 0], atol=1e-9)
     # Focus beyond infinity is only farther off.
-    assert offset(eqx.tree_at(lambda c: c.imager.sensor_distance, focused, 0.9 * f)) > 10
+    assert offset(0.9 * f) > 10
 
 
 def alone(focused, sensor_distance, diameter):
     """One lens in the middle of the plate, which nothing clips."""
     where = lambda c: (c.imager.sensor_distance, c.imager.array.centers, c.imager.array.aperture_diameter, c.at.cells)
-    return eqx.tree_at(where, focused, (jnp.array(sensor_distance), jnp.zeros((1, 2)), jnp.array(diameter), None))
+    return eqx.tree_at(where, focused, (np.array(sensor_distance), np.zeros((1, 2)), np.array(diameter), None))
 
 
 def ideal(focused, sensor_distance, diameter):
     """A thin lens without aberrations or field."""
     where, is_none = lambda c: c.imager.array.thin_lens_focal_length, lambda x: x is None
-    f = focused.imager.array.focal_length
+    f = to_numpy(focused.imager).array.focal_length
     return eqx.tree_at(where, alone(focused, sensor_distance, diameter), f, is_leaf=is_none)
 
 
@@ -109,17 +119,16 @@ def test_width_of_an_ideal_lens_out_of_focus(focused):
     80 % of its rays lie within the root of 0.8 of its radius; the quadrature has 8 rings, so a tenth of a ring's share.
     """
     lens = ideal(focused, 5.0, 1.0)
-    radius = 1000 * np.asarray(lens.term("blur_um")) / 2 / 1000
-    pixel = 4.5 / np.asarray(lens.imager.magnification(lens.at.depths))
-    airy = 0.5145 * 0.52 * 5.0 / 0.5 / np.asarray(lens.imager.magnification(lens.at.depths))
+    blur, light = lens.terms("blur_um", "light_percent")
+    radius, magnification = blur / 2, to_numpy(lens.imager).magnification(np.asarray(lens.at.depths))
+    pixel, airy = 4.5 / magnification, 0.5145 * 0.52 * 5.0 / 0.5 / magnification
     expected = np.sqrt((radius**2 / 4 + pixel**2 / 12) * 8 * np.log(2) + airy**2)
-    np.testing.assert_allclose(jax.jit(lambda c: c.term("psf_width_um"))(lens), expected, rtol=1e-9)
-    per_light = expected / np.asarray(lens.term("light_percent")) ** 0.25
-    np.testing.assert_allclose(jax.jit(lambda c: c.term("width_per_light_um"))(lens), per_light, rtol=1e-9)
-    np.testing.assert_allclose(jax.jit(lambda c: c.term("encircled_radius_um"))(lens), np.sqrt(0.8) * radius, rtol=0.03)
+    psf_width, per_light, encircled = lens.terms("psf_width_um", "width_per_light_um", "encircled_radius_um")
+    np.testing.assert_allclose(psf_width, expected, rtol=1e-9)
+    np.testing.assert_allclose(per_light, expected / light**0.25, rtol=1e-9)
+    np.testing.assert_allclose(encircled, np.sqrt(0.8) * radius, rtol=0.03)
     # The even disc falls to a half at its edge, and half of its light is within the root of a half of its radius.
-    names = ("fwhm_um", "rms_width_um", "half_light_radius_um")
-    width, rms, half = (np.asarray(size) for size in jax.jit(lambda c: [c.term(name) for name in names])(lens))
+    width, rms, half = lens.terms(*SIZES)
     np.testing.assert_allclose(width, 2 * radius, rtol=0.03)
     np.testing.assert_allclose(rms, expected / np.sqrt(8 * np.log(2)), rtol=1e-9)
     np.testing.assert_allclose(half, np.sqrt(0.5) * radius, rtol=0.03)
@@ -131,13 +140,14 @@ def test_sizes_of_a_perfect_image_are_those_of_closed_forms(focused, pixel, diam
 
     A Gaussian as wide as the Airy disc has half of its light within 1.177 sigma, 4 % less.
     """
-    v = 1 / (1 / focused.imager.array.focal_length - 1 / focused.imager.reduced_depth(20.5))
+    host = to_numpy(focused.imager)
+    v = 1 / (1 / host.array.focal_length - 1 / host.reduced_depth(20.5))
     lens = ideal(focused, v, diameter)
     sensor = dataclasses.replace(lens.imager.sensor, pixel_pitch=pixel / 1000)
-    imager, depths = dataclasses.replace(lens.imager, sensor=sensor), jnp.array([20.5])
-    at, scale = dataclasses.replace(lens.at, depths=depths), float(imager.magnification(20.5))
-    sizes = jax.jit(lambda c: [c.term(name)[0] for name in ("fwhm_um", "rms_width_um", "half_light_radius_um")])
-    width, rms, half = (float(size) * scale for size in sizes(Case(imager, at)))
+    at = dataclasses.replace(lens.at, depths=[20.5])
+    scale = float(to_numpy(lens.imager).magnification(20.5))
+    sizes = Case(dataclasses.replace(lens.imager, sensor=sensor), at).terms(*SIZES)
+    width, rms, half = (float(size[0]) * scale for size in sizes)
     if pixel > 1:
         # Of a square pixel: its side, its standard deviation, and the radius of half of its area.
         expected = pixel, np.sqrt(pixel**2 / 12 + (0.437 * 0.52 * float(v)) ** 2), pixel * np.sqrt(0.5 / np.pi)
@@ -149,13 +159,11 @@ def test_sizes_of_a_perfect_image_are_those_of_closed_forms(focused, pixel, diam
 
 
 def test_half_the_height_of_a_gaussian():
-    radii = jnp.linspace(0, 5, 101)
-    assert float(_outermost_half(radii, jnp.exp(-(radii**2) / 2))) == pytest.approx(
-        2 * np.sqrt(2 * np.log(2)), rel=1e-3
-    )
+    radii, width = np.linspace(0, 5, 101), jax.jit(_outermost_half)
+    assert float(width(radii, np.exp(-(radii**2) / 2))) == pytest.approx(2 * np.sqrt(2 * np.log(2)), rel=1e-3)
     # A ring brighter than half of the core counts.
-    ring = jnp.exp(-(radii**2) / 2) + 0.8 * jnp.exp(-((radii - 4) ** 2) / 0.1)
-    assert 8 < float(_outermost_half(radii, ring)) < 9
+    ring = np.exp(-(radii**2) / 2) + 0.8 * np.exp(-((radii - 4) ** 2) / 0.1)
+    assert 8 < float(width(radii, ring)) < 9
 
 
 @pytest.mark.integration
@@ -191,7 +199,8 @@ def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
     width = 2 * (15 - above) * 4.5 / float(lens.imager.magnification(20.5))
     axis = dataclasses.replace(lens.imager, field_radius=0.01)
     middle = Case(axis, dataclasses.replace(lens.at, depths=jnp.array([20.5])))
-    np.testing.assert_allclose(jax.jit(lambda c: c.term("psf_width_um"))(middle)[0], width, rtol=0.15)
+    (found,) = middle.terms("psf_width_um")
+    np.testing.assert_allclose(found[0], width, rtol=0.15)
 
 
 @pytest.mark.integration
@@ -210,16 +219,16 @@ def test_manufacture(design, focused, terms):
 def test_manufacture_of_a_conic(focused):
     """Of an ellipse with the half axes a and b: its curvature along a profile, and R = b^2 / a at the vertex."""
     k, radius = -0.6, 2.0
-    shaped = eqx.tree_at(lambda c: c.imager.array.conic_constant, focused, jnp.array(k))
+    shaped = eqx.tree_at(lambda c: c.imager.array.conic_constant, focused, np.array(k))
     a, b = radius / (1 + k), radius / (1 + k) ** 0.5
     half = float(objectives.clear_diameter(*focused)) / 2
+    edge_slope, sag, least = shaped.terms("edge_slope_deg", "sag_mm", "least_radius_mm")
     height = a * np.sqrt(1 - (half / b) ** 2)
     slope = np.degrees(np.arctan(a / b**2 * half / np.sqrt(1 - (half / b) ** 2)))
-    np.testing.assert_allclose(shaped.term("edge_slope_deg"), slope, rtol=1e-12)
+    np.testing.assert_allclose(edge_slope, slope, rtol=1e-12)
     rim = a * np.sqrt(1 - 1 / b**2)
-    np.testing.assert_allclose(shaped.term("sag_mm"), a - rim, rtol=1e-12)
+    np.testing.assert_allclose(sag, a - rim, rtol=1e-12)
     # (a^2 sin^2 t + b^2 cos^2 t)^(3/2) / (a b) of the profile, with x = b sin t; across it the normal's length.
-    least = np.asarray(shaped.term("least_radius_mm"))
     t = np.arcsin(half / b)
     profile = ((a * np.sin(t)) ** 2 + (b * np.cos(t)) ** 2) ** 1.5 / (a * b)
     across = np.hypot(half, height * b**2 / a**2)
@@ -229,17 +238,18 @@ def test_manufacture_of_a_conic(focused):
 def test_manufacture_of_a_polynomial(focused):
     """`sag = r^2 / (2 R) + ...` by finite differences: slope at the rim, and curvature along the profile."""
     terms = (0.03, -0.01)
-    shaped = eqx.tree_at(lambda c: c.imager.array.aspheric_terms, focused, jnp.array(terms))
+    shaped = eqx.tree_at(lambda c: c.imager.array.aspheric_terms, focused, np.array(terms))
+    edge_slope, sag, least = shaped.terms("edge_slope_deg", "sag_mm", "least_radius_mm")
     height = lambda r: 2 - np.sqrt(4 - r**2) + terms[0] * r**4 + terms[1] * r**6
-    np.testing.assert_allclose(shaped.term("sag_mm"), height(1.0), rtol=1e-12)
+    np.testing.assert_allclose(sag, height(1.0), rtol=1e-12)
     half, step = float(objectives.clear_diameter(*focused)) / 2, 1e-4
     slope = (height(half + step) - height(half - step)) / (2 * step)
-    np.testing.assert_allclose(shaped.term("edge_slope_deg"), np.degrees(np.arctan(slope)), rtol=1e-6)
+    np.testing.assert_allclose(edge_slope, np.degrees(np.arctan(slope)), rtol=1e-6)
     # At the middle of the radius, the 21st of 41 places.
     r = half / 2
     first, second = (height(r + step) - height(r - step)) / (2 * step), np.diff(height(r + step * np.arange(-1, 2)), 2)
     along, across = second[0] / step**2 / (1 + first**2) ** 1.5, first / r / (1 + first**2) ** 0.5
-    np.testing.assert_allclose(shaped.term("least_radius_mm")[20], 1 / max(along, across), rtol=1e-5)
+    np.testing.assert_allclose(least[20], 1 / max(along, across), rtol=1e-5)
 
 
 @pytest.mark.integration
