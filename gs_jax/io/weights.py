@@ -8,7 +8,6 @@ from importlib import resources
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -65,7 +64,7 @@ def read_weights(path: PathLike, skeleton: Callable[..., PyTree]) -> PyTree:
         for leaf, array in zip(leaves, arrays, strict=True):
             if array.shape != leaf.shape or array.dtype != np.float16 or not np.isfinite(array).all():
                 raise ValueError(f"must have finite float16 arrays {leaf.shape}, got {array.dtype} {array.shape}")
-    return jax.tree.unflatten(structure, [jnp.asarray(array, jnp.float32) for array in arrays])
+    return jax.tree.unflatten(structure, [jax.device_put(array.astype(np.float32)) for array in arrays])
 
 
 def shipped(name: str, skeleton: Callable[..., PyTree]) -> PyTree:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
+from jaxtyping import Array, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
-from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, host_code, native
+from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, host_code, jit, native
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
@@ -297,7 +297,7 @@ def _validity(image, peak):
 
 @jax.jit
 def _expose(image, camera, key, peak):
-    camera = jax.tree.map(lambda leaf: leaf.astype(image.dtype), camera)
+    camera, peak = jax.tree.map(lambda leaf: jnp.asarray(leaf, image.dtype), (camera, peak))
     brightest = image.max()
     scale = jnp.where(brightest > 0, peak / jnp.where(brightest > 0, brightest, 1), 0)
 
@@ -311,10 +311,11 @@ def _expose(image, camera, key, peak):
     return lax.map(lambda rows: row(*rows), (image, *keys), batch_size=_ROWS)
 
 
+@jit
 def electrons(counts: Counts, camera: Camera) -> Float32[Array, "row column"]:
     """Convert counts to electrons, `gain (counts - offset)`; dark pixels are on both sides of zero."""
     gain, offset = camera.gain.astype(jnp.float32), camera.offset.astype(jnp.float32)
-    return gain * (jnp.asarray(native(counts)).astype(jnp.float32) - offset)
+    return gain * (counts.astype(jnp.float32) - offset)
 
 
 def poisson(key: PRNGKeyArray, mean: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -354,8 +355,3 @@ def _poisson_by_sum(u, mean):
     first = jnp.exp(-mean)
     start = (jnp.ones((), u.dtype), jnp.zeros_like(u), first, first)
     return lax.while_loop(lambda state: searching(state).any(), step, start)[1]
-
-
-def _check_value(name: str, value, ok: Bool[Array, ""], allowed: str):
-    if not isinstance(ok, Tracer) and not ok:
-        raise ValueError(f"`{name}` must be {allowed}, got {value}.")
