@@ -9,6 +9,7 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.path import Path as MatplotlibPath
@@ -318,6 +319,11 @@ def mtf(
 
 def ideal_mtf(frequency: Float[np.ndarray, " frequency"], imager: Imager, depth: float, diameter: float) -> np.ndarray:
     """Modulation transfer of a focused round lens without aberrations, and of square pixels."""
-    on_sensor = frequency / float(imager.magnification(depth))
-    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
-    return np.asarray(theory.ideal_mtf(on_sensor, cutoff)) * np.abs(np.sinc(on_sensor * imager.sensor.pixel_pitch))
+    on_sensor = frequency / float(to_numpy(imager).magnification(depth))
+    values = np.asarray(_ideal_mtf(on_sensor, imager.wavelength, imager.reduced_sensor_distance, diameter))
+    return values * np.abs(np.sinc(on_sensor * imager.sensor.pixel_pitch))
+
+
+@jax.jit
+def _ideal_mtf(frequency, wavelength, distance, diameter):
+    return theory.ideal_mtf(frequency, theory.cutoff_frequency(wavelength, distance, diameter))

@@ -5,7 +5,6 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Num
 
@@ -19,6 +18,7 @@ from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
 from ...io.surfaces import SurfaceMaps, surface_mesh
+from ...optics.raytrace import to_numpy
 from ...pictures import color_table, make_slices, png_uri, scale_bar_html, slider_html, to_base64, to_uint8
 from ...typing import Image, PathLike, Points
 from . import report_tables as tables
@@ -215,7 +215,7 @@ def _psf_pictures(psfs: Psfs, imager: Imager) -> dict[str, Any]:
 
 def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
     def curve(i: int, j: int):
-        magnification = float(imager.magnification(jnp.asarray(psfs.depths[i])))
+        magnification = float(to_numpy(imager).magnification(psfs.depths[i]))
         return mtf(psfs.images[i, j], float(psfs.caught[i, j]), imager.sensor.pixel_pitch, magnification)
 
     def chart(curves, title: str) -> str:
