@@ -25,7 +25,7 @@ def scattered(count=300, *, half=(0.3, 0.4), seed=0):
 
 
 def grid(depths=DEPTHS, shape=(9, 7), pitch=0.1, dtype=float):
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), Grid(depths, shape, pitch))
+    return jax.tree.map(lambda leaf: jax.device_put(np.array(leaf, dtype)), Grid(depths, shape, pitch))
 
 
 # --- rasterize ---
@@ -102,8 +102,8 @@ def test_gradients_of_rasterize():
 def test_gradients_are_finite_at_kinks_edges_and_outside():
     emitters = np.array([[0, 0, 18, 1], [0.3, -0.4, 23, 1], [0.35, 0, 17.8, 0], [9, 9, 40, 1]], float)
     square = lambda emitters, depths: (rasterize(emitters, Grid(depths, (9, 7), 0.1)) ** 2).sum()
-    for gradient in jax.grad(square, (0, 1))(jnp.asarray(emitters), grid().depths):
-        assert jnp.isfinite(gradient).all()
+    for gradient in jax.jit(jax.grad(square, (0, 1)))(emitters, grid().depths):
+        assert np.isfinite(gradient).all()
 
 
 def test_rasterize_under_jit_and_of_nothing():

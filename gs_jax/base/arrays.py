@@ -87,9 +87,8 @@ def check_finite(name: str, values: Shaped[Array | np.ndarray, "..."], parts: st
     """
     if np.issubdtype(values.dtype, np.integer) or is_traced(values):
         return
-    finite = array_namespace(values).isfinite(values)
-    if not finite.all():
-        raise input_error(name, "finite", f"{int((~finite).sum())} of {values.size} {parts} NaN or infinite")
+    if wrong := np.count_nonzero(~np.isfinite(np.asarray(values))):
+        raise input_error(name, "finite", f"{wrong} of {values.size} {parts} NaN or infinite")
 
 
 def check_real(name: str, values: Shaped[Array | np.ndarray, "..."]) -> None:

@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from PIL import Image, ImageDraw, ImageFont
 
+from ..base.arrays import native
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
 from ..layouts import check_positive, half_size
@@ -196,12 +197,12 @@ def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> F
 
 @jax.jit
 def _rasterize(emitters, grid):
-    x, y, z, intensity = emitters.T
+    x, y, z, intensity = jnp.asarray(emitters, grid.depths.dtype).T
     shape = grid.volume_shape
     places = ((y - grid.origin[1], grid.shape[0]), (x - grid.origin[0], grid.shape[1]))
     row, column = (at / grid.pitch + (n - 1) / 2 for at, n in places)
     axes = [_shares(index, n) for index, n in zip((_depth_index(z, grid), row, column), shape, strict=True)]
-    volume = jnp.zeros(shape, emitters.dtype)
+    volume = jnp.zeros(shape, intensity.dtype)
     for corner in product(*axes):
         indices, weights = zip(*corner, strict=True)
         volume = volume.at[indices].add(intensity * math.prod(weights), mode="drop")
