@@ -309,6 +309,9 @@ def metrics(case: Case, _) -> None:
     np.testing.assert_allclose(case.sheet["magnification"], magnification, rtol=1e-5)
     for name in ("lateral_resolution_um", "axial_resolution_um", "occupancy", "lenses_per_point"):
         assert np.all(np.asarray(case.sheet[name]) > 0), name
+
+
+def widths(case: Case, _) -> None:
     # The sheet's widths have five digits.
     light, found = map(np.asarray, light_and_width(case.imager, np.array(case.depths)))
     np.testing.assert_allclose(1000 * found, case.sheet["spot_width_um"] / (100 * light) ** 0.25, rtol=1e-4)
@@ -401,6 +404,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     "calibrate": calibrate,
     "pattern": pattern,
     "metrics": metrics,
+    "widths": widths,
     "map": one_map,
     "design": from_imager,
     "optimise": optimise,
@@ -421,10 +425,17 @@ REFUSED: dict[tuple[str, str], str] = {
 # Whatever reads the cores of spots warns.
 WARNED = {("out of focus", task) for task in ("points", "list-rl", "unrolled")}
 
-# `make test` runs these for every device; a search for each structure of an imager, which compiles it; a mold for
-# each kind of lens, whatever else the device has; and each of the rest somewhere. `make integration` runs all others.
-ALWAYS = ("design", "map", "metrics")
+# `make test` runs these for every device; a datasheet and a search for the structures of an imager, which compile them,
+# a mold for each kind of lens, whatever else the device has, and each of the rest somewhere. `make integration` runs
+# all others.
+ALWAYS = ("design", "map")
 ONCE = {
+    "metrics": (
+        *("geomscope", "geomscope-asphere", "geomscope-optimized", "out of focus", "steep", "curved side", "conic"),
+        *("aspheric", "layers", "samples", "turned", "mirrored", "region", "binned", "odd", "one lens"),
+        "curved, tilted, two radii, layers",
+    ),
+    "widths": ("geomscope", "curved, tilted, two radii, layers"),
     "optimise": (
         *("geomscope", "geomscope-asphere", "aspheric", "two radii", "layers", "tilted", "one lens"),
         "curved, tilted, two radii, layers",
@@ -433,14 +444,14 @@ ONCE = {
         *("geomscope", "geomscope-asphere", "steep", "aspheric", "two radii", "small lenses", "one lens"),
         "curved, tilted, two radii",
     ),
-    "points": ("geomscope-asphere", "one lens", "curved, tilted, two radii, layers"),
+    "points": ("geomscope-asphere", "one lens", "tilted, layers"),
     "backproject": ("endoscope",),
-    "list-rl": ("geomscope", "float64"),
+    "list-rl": ("curved, tilted, two radii, layers", "float64"),
     "richardson-lucy": ("turned",),
     "fista": ("geomscope-optimized",),
     "admm": ("region",),
     "surface": ("odd",),
-    "unrolled": ("curved, tilted, two radii, layers",),
+    "unrolled": ("geomscope",),
     "calibrate": ("geomscope",),
     "pattern": ("mirrored",),
     "report": ("geomscope-optimized",),
@@ -457,7 +468,7 @@ FEW = ("samples", "small lenses")
 def pairs():
     for device in (name for name in DEVICES if name not in (LARGE, FINE)):
         for task in TASKS:
-            few = device in FEW and task not in (*ALWAYS, "optimise", "mold")
+            few = device in FEW and task not in (*ALWAYS, "metrics", "widths", "optimise", "mold")
             if few or task in ON_THE_RICHEST and device not in RICHEST:
                 continue
             marks = () if task in ALWAYS or device in ONCE.get(task, ()) else pytest.mark.integration

@@ -275,7 +275,11 @@ def tables_of(imager: Imager) -> dict[str, Any]:
         raise InputError("`band` must be None: a design makes its own, of its materials and `imaging.bandwidth_nm`.")
     tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
     focal_length = array.thin_lens_focal_length
-    of_lenses = lambda name: _decimal(getattr(array, name) if array.alike else array.of_lenses(name))
+
+    def of_lenses(name: str) -> Any:
+        of_types = np.ravel(getattr(array, name))
+        return _decimal(of_types[0] if (of_types == of_types[0]).all() else array.of_lenses(name))
+
     return {
         "sensor": {
             "pixel_pitch_um": _scaled(np.float64(1000 * sensor.pixel_pitch)),
