@@ -73,7 +73,8 @@ def _cores_image(volume, imager, grid, optics):
     def add_depth(images, plane):
         fine, coarse = images
         depth, fine_voxels, coarse_voxels, distortion, light, kernels, wide_kernels, harmonics, wide_harmonics = plane
-        rings = _Rings(*jnp.asarray(edges, dtype).T, distortion, light)
+        inner_edge, outer_edge = jnp.asarray(edges, dtype).T
+        rings = _Rings(inner_edge, outer_edge, distortion, light)
         near, far = (jax.tree.map(lambda part, at=at: part[at], rings) for at in (slice(inner), slice(inner, None)))
         here = _Plane(wide, grid.at(depth), fine_voxels, limits[0])
         there = _Plane(wide_half, outer_grid.at(depth), coarse_voxels, limits[1])

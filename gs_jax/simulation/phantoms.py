@@ -17,7 +17,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from PIL import Image, ImageDraw, ImageFont
 
-from ..base.arrays import native
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
 from ..layouts import check_positive, half_size

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
 from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, host_code, jit, native
