@@ -106,7 +106,7 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     # Behind a plate the light goes on as from farther along its normal.
     vertices = vertices - behind * turn.apply([0, 0, 1])
     onward = onward[:, :2] * ((v + behind + vertices[:, 2]) / -onward[:, 2])[:, None]
-    return imager.sensor.to_pixels(vertices[:, :2] + onward)
+    return np.asarray(imager.sensor.to_pixels(vertices[:, :2] + onward))
 
 
 def captures(imager: Imager, points=POINTS, of=None) -> list[np.ndarray]:

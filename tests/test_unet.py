@@ -111,7 +111,7 @@ def test_the_core_is_the_middle_of_the_whole(widths):
     margin, step = network.margin, network.multiple
     # The whole has to be of as many voxels as pools divide.
     spare = -margin % step
-    tile = stack(3, 3 * step + 2 * margin + 2 * spare, 2 * step + 2 * margin + 2 * spare)
+    tile = jnp.asarray(stack(3, 3 * step + 2 * margin + 2 * spare, 2 * step + 2 * margin + 2 * spare))
     part = tile[:, spare : tile.shape[1] - spare, spare : tile.shape[2] - spare]
     whole, edge = np.asarray(eqx.filter_jit(network)(tile)), margin + spare
     core = np.asarray(eqx.filter_jit(network.core)(part))

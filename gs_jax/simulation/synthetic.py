@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
 from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, host_code, jit, native
@@ -278,20 +279,15 @@ def expose(
     >>> print(counts.dtype, round(float(np.median(counts))))  # dark pixels: the offset
     uint16 16
     """
-    image = jnp.asarray(native(image))
-    peak = jnp.asarray(peak_electrons, image.dtype)
-    wrong, positive = _validity(image, peak)
-    _check_value("peak_electrons", peak, positive, "positive and finite")
-    _check_value("image", f"{wrong} pixels that are not", wrong == 0, "finite and not negative")
-    return _expose(image, camera, key, peak)
-
-
-@jax.jit
-def _validity(image, peak):
-    """Number of pixels that are negative or not finite, and whether the peak is positive and finite."""
-    # Not `min` and `max`: they pass over a NaN on some devices.
-    wrong = ~((image >= 0) & (image < jnp.inf))
-    return wrong.sum(), (peak > 0) & jnp.isfinite(peak)
+    image = native(image)
+    # On the host: JAX would compile comparisons for each shape.
+    if not isinstance(peak_electrons, Tracer) and not 0 < peak_electrons < math.inf:
+        raise ValueError(f"`peak_electrons` must be positive and finite, got {peak_electrons}.")
+    if not isinstance(image, Tracer):
+        light = np.asarray(image)
+        if wrong := np.count_nonzero(~((light >= 0) & (light < math.inf))):
+            raise ValueError(f"`image` must be finite and not negative, got {wrong} pixels that are not.")
+    return _expose(image, camera, key, peak_electrons)
 
 
 @jax.jit
