@@ -13,7 +13,7 @@ from ..geometry import Imager
 from ..objectives.conditions import Conditions
 from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory
-from ..optics.raytrace import trace_lenslet
+from ..optics.raytrace import to_numpy, trace_lenslet
 from .datasheets import circle_of_confusion_of, parts_of
 from .design import Design
 
@@ -57,8 +57,7 @@ def _rays(sheet: dict[str, Any]) -> list[str]:
 
 def _sharp_cores(imager: Imager, at: Conditions) -> list[str]:
     """Where most light falls into a core three pixels wide, on the axis."""
-    depths = jnp.geomspace(at.depths[0] / 2, 2 * at.depths[-1], _DEPTHS)
-    within = np.asarray(_light_within(imager, at, depths, 1.5 * imager.sensor.pixel_pitch))
+    depths, within = map(np.asarray, _light_within(imager, at, 1.5 * imager.sensor.pixel_pitch))
     best = within.argmax()
     if best in (0, _DEPTHS - 1):
         return []
@@ -68,12 +67,13 @@ def _sharp_cores(imager: Imager, at: Conditions) -> list[str]:
 
 
 @eqx.filter_jit
-def _light_within(imager, at, depths, radius):
-    """Of a point on a lens's axis, by exact rays, relative."""
+def _light_within(imager, at, radius):
+    """Depths, and of a point there on a lens's axis the light within a radius, by exact rays, relative."""
+    depths = jnp.geomspace(at.depths[0] / 2, 2 * at.depths[-1], _DEPTHS)
     radii = jnp.asarray((np.arange(_RAYS) + 0.5) / _RAYS, depths.dtype) * objectives.clear_diameter(imager, at) / 2
     pupil = jnp.stack([radii, jnp.zeros_like(radii)], -1)
     rays = jax.vmap(lambda depth: trace_lenslet(imager, depth, pupil))(depths)
-    return jnp.sum(jnp.where(rays.valid & (jnp.abs(rays.landing[..., 0]) < radius), radii, 0), -1)
+    return depths, jnp.sum(jnp.where(rays.valid & (jnp.abs(rays.landing[..., 0]) < radius), radii, 0), -1)
 
 
 def _focus(
@@ -112,15 +112,12 @@ def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:
 
 
 def _sharp_range(design: Design, imager: Imager, at: Conditions) -> str:
-    v, f = design.imaging.sensor_distance_mm, float(imager.array.focal_length)
-    if imager.reduced_sensor_distance <= f:
+    host = to_numpy(imager)
+    v, f, begins = design.imaging.sensor_distance_mm, float(host.array.focal_length), float(host.sample_surface)
+    if host.reduced_sensor_distance <= f:
         return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
-    in_focus = imager.depth_of(theory.depth_in_focus(f, imager.reduced_sensor_distance))
-    focused, begins = dataclasses.replace(at, depths=in_focus[None]), float(imager.sample_surface)
-    near, far = (
-        max(float(objectives.near_limit(imager, focused)[0]), begins),
-        float(objectives.far_limit(imager, focused)[0]),
-    )
+    near, far = map(float, _limits(imager, at))
+    near = max(near, begins)
     working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
     if far <= begins:
         where = f"before {begins:g} mm, where the object's medium begins," if begins else "within the plate"
@@ -128,14 +125,28 @@ def _sharp_range(design: Design, imager: Imager, at: Conditions) -> str:
     return f"In focus by Eqs. 7 and 8, of a thin lens, are {near:.4g} to {far:.4g} mm; {working}."
 
 
+@eqx.filter_jit
+def _limits(imager, at):
+    """Nearest and farthest depth in focus."""
+    in_focus = imager.depth_of(theory.depth_in_focus(imager.array.focal_length, imager.reduced_sensor_distance))
+    focused = dataclasses.replace(at, depths=in_focus[None])
+    return objectives.near_limit(imager, focused)[0], objectives.far_limit(imager, focused)[0]
+
+
+@eqx.filter_jit
+def _wavefront(imager, at):
+    """RMS error on the axis, waves; the field where the Strehl ratio halves, spherical aberration and balanced, mm."""
+    error, pupil = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype)), at.clear_diameter / 2
+    v, reduced = imager.reduced_sensor_distance, imager.reduced_depth(at.depths)
+    half = aberrations.linear_field_radius(imager.array, pupil, reduced, v, imager.wavelength)
+    waves = aberrations.linear_rms(error)[:, 0] / imager.wavelength
+    return waves, half, error.spherical[0, 0], aberrations.balanced_rms(error).spherical[0, 0]
+
+
 def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Conditions) -> list[str]:
-    wavelength, pupil = float(imager.wavelength), float(objectives.clear_diameter(imager, at)) / 2
-    error = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
-    waves = np.asarray(aberrations.linear_rms(error))[:, 0] / wavelength
+    waves, half, spherical, balanced = map(np.asarray, _wavefront(imager, at))
     if waves.max() <= _STREHL_DOMAIN:
         return []
-    array, v, reduced = imager.array, imager.reduced_sensor_distance, imager.reduced_depth(at.depths)
-    half = np.asarray(aberrations.linear_field_radius(array, pupil, reduced, v, wavelength)) * 1000
     found = [
         f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
         "the Strehl ratios only say that the image is far from diffraction-limited."
@@ -143,13 +154,14 @@ def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Condition
     if design.lens.focal_length_mm is not None:  # an ideal lens: all of it is defocus
         return found
     found.append(
-        f"By Eqs. 9 and 10 the Strehl ratio halves {_span(half)} um beside the axis, "
+        f"By Eqs. 9 and 10 the Strehl ratio halves {_span(1000 * half)} um beside the axis, "
         f"not at the field radius of {_length(sheet['field_radius_mm'])}."
     )
     paraxial = sheet["focus_distance_mm"]
-    if paraxial[0] is not None and aberrations.balanced_rms(error).spherical[0, 0] > _STREHL_DOMAIN * wavelength:
-        image = paraxial[0] + float(v - imager.sensor_distance)
-        sharpest = 1 / (1 / image + 2 * float(error.spherical[0, 0]) / pupil**2)
+    host, pupil = to_numpy(imager), float(objectives.clear_diameter(imager, at)) / 2
+    if paraxial[0] is not None and balanced > _STREHL_DOMAIN * host.wavelength:
+        image = paraxial[0] + float(host.reduced_sensor_distance - host.sensor_distance)
+        sharpest = 1 / (1 / image + 2 * float(spherical) / pupil**2)
         found.append(
             "Focus and blur are a thin lens's; spherical aberration draws the sharpest image of "
             f"{sheet['depth_mm'][0]:g} mm toward the lens, by up to {_length(image - sharpest)}."
