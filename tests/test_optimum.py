@@ -243,12 +243,15 @@ def test_objectives_have_the_gradients_of_finite_differences():
 
 def test_an_objective_is_one_program():
     """After the clear diameter and the lens that stands for all; other numbers and depths find it."""
-    blur, light, scope = objectives.blur, objectives.light, small()
-    blur(scope, DEPTHS), light(scope, DEPTHS)
+    scope, other = small(), small(radius_of_curvature=2.1, conic_constant=-0.5)
+    for quantity in (objectives.blur, objectives.light):
+        quantity(scope, DEPTHS)
     before = compilations()
-    blur(small(radius_of_curvature=2.1), (DEPTHS + 0.5).tolist()), light(small(conic_constant=-0.5), DEPTHS - 0.5)
+    for quantity in (objectives.blur, objectives.light):
+        quantity(other, (DEPTHS + 0.5).tolist())
     assert compilations() == before
-    objectives.sensor_blur(scope, DEPTHS), objectives.focus_distance(scope, DEPTHS)
+    for quantity in (objectives.sensor_blur, objectives.focus_distance):
+        quantity(scope, DEPTHS)
     assert compilations() == before + 2
 
 
