@@ -110,6 +110,19 @@ def _derivative(equation: JaxprEqn) -> ClosedJaxpr:
     return jax.make_jaxpr(derivative)(*(jax.ShapeDtypeStruct(_aval(x).shape, _aval(x).dtype) for x in variables))
 
 
+class _Unhashable:
+    """A parameter that is equal to nothing but itself; kept, as its identity is another object's after its end."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Unhashable) and self.value is other.value
+
+
 def _parameter(value: Any, derivatives: bool) -> Any:
     if isinstance(value, ClosedJaxpr):
         consts = ((x.dtype.str, x.shape, x.tobytes()) for x in map(np.asarray, value.consts))
@@ -121,5 +134,5 @@ def _parameter(value: Any, derivatives: bool) -> Any:
     try:
         hash(value)
     except TypeError:
-        return id(value)
+        return _Unhashable(value)
     return value
