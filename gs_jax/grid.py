@@ -3,6 +3,7 @@
 Volumes are `[depth, row, column]`; lengths are in millimetres.
 """
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -135,8 +136,8 @@ class Grid(eqx.Module):
         return cls(depths, (rows, columns), pitch, sensor.origin)
 
     def at(self, depths) -> "Grid":
-        """The same voxels at other depths `(depth,)`, or at a single one, mm."""
-        return eqx.tree_at(lambda g: g.depths, self, jnp.atleast_1d(jnp.asarray(depths, self.depths.dtype)))
+        """The same voxels at other depths `(depth,)`, or at a single one, mm; `ValueError` as for a new grid."""
+        return dataclasses.replace(self, depths=jnp.atleast_1d(jnp.asarray(depths, self.depths.dtype)))
 
     @property
     def volume_shape(self) -> tuple[int, int, int]:

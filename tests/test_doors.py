@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -167,3 +168,17 @@ def test_a_call_without_compilation():
         with disable_jit():
             volume = gs.backproject(IMAGE, SCOPE, GRID)
     np.testing.assert_allclose(volume, expected, rtol=1e-5, atol=1e-5 * float(expected.max()))
+
+
+def test_a_nan_that_was_put_into_a_module_is_named():
+    """`eqx.tree_at` makes modules without their checks; NaNs would end as dark images."""
+    lost = eqx.tree_at(lambda i: i.array.centers, SCOPE, SCOPE.array.centers.at[1, 0].set(np.nan))
+    nowhere = eqx.tree_at(lambda g: g.depths, GRID, GRID.depths.at[0].set(np.nan))
+    for call in (
+        lambda: gs.backproject(IMAGE, lost, GRID),
+        lambda: gs.forward(np.ones(GRID.volume_shape), lost, GRID),
+    ):
+        with pytest.raises(gs.InputError, match=r"Imager.array.centers must be numbers, got 1 NaN"):
+            call()
+    with pytest.raises(gs.InputError, match=r"Grid.depths must be numbers, got 1 NaN"):
+        gs.backproject_adjoint(np.ones(GRID.volume_shape), SCOPE, nowhere)

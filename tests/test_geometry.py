@@ -136,6 +136,7 @@ def test_map_is_separable():
         (lambda: MicrolensArray([[0.0, 0.0]], substrate_thickness=-1.0), "`substrate_thickness` must be .*, got -1"),
         (lambda: Grid([20.0, -18.0], (3, 3), 0.1), "`depths` must be positive and finite, got -18"),
         (lambda: Grid([np.nan], (3, 3), 0.1), "`depths` must be positive and finite, got nan"),
+        (lambda: Grid([20.0], (3, 3), 0.1).at([18.0, np.inf]), "`depths` must be positive and finite, got inf"),
     ],
 )
 def test_wrong_shapes_and_numbers_are_named(make, words):

@@ -105,6 +105,16 @@ def test_what_cannot_be_simulated_is_refused():
         (np.full((1, 3, 3), np.nan), Grid([20.0], (3, 3), 0.05), "scene must be finite, got 9 of 9 voxels NaN"),
         (np.array([[0.0, np.nan, 20.0, 1.0]]), None, "scene must be finite, got 1 of 4 numbers NaN"),
         (
+            np.zeros((3, 5, 4)),
+            None,
+            r"scene must be points \(point, 4\), or a volume with its grid",
+        ),
+        (
+            np.zeros((1, 3, 4)),
+            Grid([20.0], (3, 3), 0.05),
+            r"scene must have the grid's shape \(1, 3, 3\)",
+        ),
+        (
             np.array([[0.0, 0.0, 20.0, 1.0], [0.0, 0.0, -20.0, 1.0]]),
             None,
             "depths of points must be positive, got -20 mm",

@@ -35,10 +35,10 @@ def _is_foreign(leaf: Any) -> bool:
 
 
 def jit(function: Callable, **options: Any) -> Any:
-    """`jax.jit` for arrays of any byte order.
+    """`jax.jit` for arrays of any byte order, which refuses modules with a NaN.
 
     JAX refuses arrays of the other byte order, but a compiled function that has seen the native type takes their bytes
-    as they are, so that 1 is read as 256.
+    as they are, so that 1 is read as 256. Modules check their numbers when they are made, and not in `eqx.tree_at`.
     """
     compiled = jax.jit(function, **options)
 
@@ -46,11 +46,21 @@ def jit(function: Callable, **options: Any) -> Any:
     def call(*args, **kwargs):
         if any(map(_is_foreign, jax.tree.leaves((args, kwargs)))):
             args, kwargs = native((args, kwargs))
+        for value in (*args, *kwargs.values()):
+            if hasattr(type(value), "__check_init__"):
+                _check_no_nan(value)
         return compiled(*args, **kwargs)
 
     for name in ("lower", "_cache_size"):
         setattr(call, name, getattr(compiled, name))
     return call
+
+
+def _check_no_nan(module: Any) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(module):
+        if eqx.is_inexact_array(leaf) and not isinstance(leaf, Tracer) and np.isnan(np.asarray(leaf)).any():
+            name = f"{type(module).__name__}{jax.tree_util.keystr(path)}"
+            raise InputError(f"{name} must be numbers, got {np.count_nonzero(np.isnan(np.asarray(leaf)))} NaN.")
 
 
 def array_namespace(x: Any) -> Any:

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+import equinox as eqx
+import jax
 import numpy as np
 import tifffile
 from PIL import Image
@@ -159,7 +161,11 @@ class DepthFrame(NamedTuple):
 
     def grid(self, grid: Grid) -> Grid:
         """The grid of an output, from one with depths from the array."""
-        return grid if self.surface is None else grid.at(moved(grid.depths, -self.surface))
+        if self.surface is None:
+            return grid
+        # Not `at`: at the surface a depth is 0.
+        depths = np.asarray(moved(grid.depths, -self.surface), grid.depths.dtype)
+        return eqx.tree_at(lambda g: g.depths, grid, jax.device_put(depths))
 
     def columns(self, columns: Mapping[str, Any]) -> dict[str, Any]:
         """Columns of points in single precision, nine digits, from those with depths from the array."""

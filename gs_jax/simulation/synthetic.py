@@ -107,6 +107,7 @@ def simulate(
         raise InputError(f'`psf` needs optics "near", which has one PSF; got {short_repr(psf)} with "full".')
     if psf not in (None, *PSFS):
         raise InputError(f"`psf` must be one of {', '.join(PSFS)}, got {short_repr(psf)}.")
+    _check_shape(np.shape(scene), grid)
     check_beyond(imager, np.asarray(scene)[:, 2] if grid is None else np.asarray(grid.depths), "scene: depths")
     light = np.asarray(scene)[:, 3] if grid is None else np.asarray(scene)
     if light.size and (most := float(np.max(light))) > MAX_LIGHT:
@@ -124,6 +125,14 @@ def simulate(
     light = np.ones(len(each)) if optics == "full" else relative_areas(each)
     images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
     return np.sum(images, 0)
+
+
+def _check_shape(shape: tuple[int, ...], grid: Grid | None) -> None:
+    if grid is None and (len(shape) != 2 or shape[1] != 4):
+        allowed = "points (point, 4), or a volume with its grid" if len(shape) == 3 else "points (point, 4)"
+        raise InputError(f"scene must be {allowed}, got the shape {shape}.")
+    if grid is not None and shape != grid.volume_shape:
+        raise InputError(f"scene must have the grid's shape {grid.volume_shape}, got {shape}.")
 
 
 def simulate_volume(
