@@ -183,7 +183,7 @@ class MicrolensArray(eqx.Module):
 
     def lens(self, index: int) -> "MicrolensArray":
         """One of the lenses alone, on the same plate."""
-        return self._alike(_at(self.centers, [index]), _at(self.type_of_lens, index))
+        return self._alike(_at(self.centers, np.array([index])), _at(self.type_of_lens, index))
 
     def of_type(self, number: int) -> "MicrolensArray":
         """All lenses, with the numbers of one type."""
