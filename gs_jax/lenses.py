@@ -37,7 +37,7 @@ def _as_types(x):
 def _at(values, index):
     """Some entries of an array; on the host if they are known, as JAX compiles programs to index each shape."""
     if isinstance(values, Tracer) or isinstance(index, Tracer):
-        return values[index]
+        return jnp.asarray(values)[index]
     entries = np.asarray(values)[np.asarray(index)]
     return entries if isinstance(values, np.ndarray) else jax.device_put(entries)
 

@@ -409,11 +409,13 @@ def test_a_model_of_other_planes_pixels_or_objects_is_refused():
         ("full", voxels, "optics must be a PSF model .*, got 'full'"),
     ]:
         if wrong is None:
-            of_rays = forward(x, scope, seen_by)
-            np.testing.assert_array_equal(forward(x, scope, seen_by, model), of_rays)
+            of_rays = np.asarray(forward(x, scope, seen_by))
+            # Different programs round differently, relative to the brightest pixel.
+            tolerance = 1e-14 * of_rays.max()
+            np.testing.assert_allclose(forward(x, scope, seen_by, model), of_rays, rtol=0, atol=tolerance)
             # Model and grid are known also where the volume is traced.
-            traced = jax.jit(lambda x: forward(x, scope, voxels, near))(x)
-            np.testing.assert_allclose(traced, of_rays, rtol=1e-12, atol=1e-12 * float(of_rays.max()))
+            traced_volume = jax.jit(lambda x: forward(x, scope, voxels, near))(x)
+            np.testing.assert_allclose(traced_volume, of_rays, rtol=0, atol=tolerance)
             continue
         with pytest.raises(InputError, match=wrong):
             forward(x, scope, seen_by, model)
