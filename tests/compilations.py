@@ -2,6 +2,7 @@
 
 import tomllib
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 
 import jax
 import pytest
@@ -14,17 +15,12 @@ _module = "gs_jax"
 
 def _count(event: str, duration_secs: float, **_: str | int) -> None:
     if event == EVENT:
-        _add({_module: (1, duration_secs)})
+        _totals[_module][0] += 1
+        _totals[_module][1] += duration_secs
 
 
 # JAX keeps listeners for good: one counts for all tests of a process.
 jax.monitoring.register_event_duration_secs_listener(_count)
-
-
-def _add(totals) -> None:
-    for module, (programs, seconds) in totals.items():
-        _totals[module][0] += programs
-        _totals[module][1] += seconds
 
 
 def compilations() -> int:
@@ -35,13 +31,14 @@ def compilations() -> int:
 class CompileBudget:
     """Add up the programs of test modules over workers, report the dearest, and fail above the budget.
 
-    The first module in a process that needs a program pays for it. A module compiles most when it runs alone, and
-    that is what the budget is made from, so it does not matter how tests are spread over workers. Tests marked
-    `integration` or `slow` have no budget.
+    The first module in a process that needs a program pays for it. A module compiles most when all of it runs alone,
+    and that is what its budget is made from. So the largest number of a worker counts, and it does not matter how
+    tests are spread. Tests marked `integration` or `slow` have no budget.
     """
 
     def __init__(self, config: pytest.Config):
         self.config = config
+        self.workers: list[Mapping[str, Sequence[float]]] = [_totals]
 
     @pytest.hookimpl(wrapper=True)
     def pytest_make_collect_report(self, collector):
@@ -58,7 +55,8 @@ class CompileBudget:
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node):
-        _add(getattr(node, "workeroutput", {}).get("compilations", {}))
+        # A worker that crashed has none.
+        self.workers.append(getattr(node, "workeroutput", {}).get("compilations", {}))
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_sessionfinish(self, session):
@@ -73,9 +71,13 @@ class CompileBudget:
         if not path:
             return []
         budget = tomllib.loads((self.config.rootpath / path).read_text())
-        counts = {module: programs for module, (programs, _) in _totals.items() if "(" not in module}
+        counts, all_modules = defaultdict[str, float](float), 0.0
+        for worker in self.workers:
+            for module, (programs, _) in worker.items():
+                if "(" not in module:
+                    counts[module], all_modules = max(counts[module], programs), all_modules + programs
         limits = {module: budget["modules"].get(module, budget["module"]) for module in counts}
-        counts["all modules"], limits["all modules"] = sum(counts.values()), budget["total"]
+        counts["all modules"], limits["all modules"] = all_modules, budget["total"]
         return [
             f"{module}: {programs} programs compiled, {limits[module]} allowed by {path}"
             for module, programs in counts.items()
@@ -83,11 +85,15 @@ class CompileBudget:
         ]
 
     def pytest_terminal_summary(self, terminalreporter):
-        seconds = sum(duration for _, duration in _totals.values())
+        sums = defaultdict[str, tuple[float, float]](lambda: (0, 0.0))
+        for worker in self.workers:
+            for module, (programs, seconds) in worker.items():
+                sums[module] = sums[module][0] + programs, sums[module][1] + seconds
+        programs, seconds = (sum(column) for column in zip((0, 0.0), *sums.values(), strict=True))
         terminalreporter.section("programs compiled")
-        terminalreporter.line(f"{compilations()} programs in {seconds:.0f} s. Modules with most of these seconds:")
-        dearest = sorted(_totals.items(), key=lambda item: item[1][1], reverse=True)[:15]
-        for module, (programs, duration) in dearest:
-            terminalreporter.line(f"{programs:6d} {duration:7.1f} s  {module}")
+        terminalreporter.line(f"{programs} programs in {seconds:.0f} s. Modules with most of these seconds:")
+        dearest = sorted(sums.items(), key=lambda item: item[1][1], reverse=True)[:15]
+        for module, (programs, seconds) in dearest:
+            terminalreporter.line(f"{programs:6d} {seconds:7.1f} s  {module}")
         for line in self.excess():
             terminalreporter.line(line, red=True)
