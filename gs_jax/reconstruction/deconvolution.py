@@ -17,7 +17,7 @@ from ..solvers.admm import ADMM
 from ..solvers.convolution import ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
-from ..solvers.stepping import run_solver
+from ..solvers.stepping import estimate_of, run_solver
 from ..typing import Image
 from .inverse_problem import subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR
@@ -174,7 +174,7 @@ def run_deconvolution(
         counts = isinstance(solver, RichardsonLucy)
         target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image) / unit, light, counts=counts)
     run = run_solver(solver, light, system, progress, target=target, quarter="twice the --binning")
-    scene = np.asarray(solver.estimate(run.state), np.float32)
+    scene = np.asarray(estimate_of(solver, run.state), np.float32)
     difference = np.asarray(image_of(system, scene)) - light
     residual = float(np.linalg.norm(difference) / (np.linalg.norm(light) or 1))
     scene = unit * scene[:, *system.window]

@@ -1,5 +1,6 @@
 """The inverse problem of iterative methods: pixels binned to the size of voxels, the data to explain, the operator."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from ..optics.field_varying import FieldVaryingPsf
 from ..optics.lens_types import height_bands, split_groups, type_weights
 from ..optics.psf_core import core_distortion
 from ..projection.forward_model import Optics, PsfModel, check_optics, psf_model
-from ..projection.operators import BackprojectionOperator, ImagingOperator
+from ..projection.operators import BackprojectionOperator, ImagingOperator, as_matrix, no_structure, transpose
 from ..solvers.base import Operator, UnmatchedAdjointOperator
 from ..typing import Image
 
@@ -113,47 +114,70 @@ class InverseProblem(eqx.Module):
 
     @property
     def operator(self) -> Operator:
-        A = self._of_all_pixels
-        if self.kept is None:
-            return A
-        kept = jnp.asarray(self.kept)
-        forward, back, squares = A, A.T, A
-        if isinstance(A, UnmatchedAdjointOperator):
-            forward, back, squares = A.forward, A.back, A.least_squares or A.forward
-        shown = lambda some: lx.FunctionLinearOperator(lambda x: kept * some.mv(x), some.in_structure())
-        read = lx.FunctionLinearOperator(lambda image: back.mv(kept * image), back.in_structure())
-        return UnmatchedAdjointOperator(shown(forward), read, shown(squares), kept)
-
-    @property
-    def _of_all_pixels(self) -> Operator:
         A = ImagingOperator(self.imager, self.grid, self.optics)
-        least_squares = A
-        if self.detrend_modes:
-            least_squares = lx.FunctionLinearOperator(lambda x: self.detrend(A.mv(x)), A.in_structure())
-        if self.back_projections is None:
-            return least_squares
-        # With the pixels of this problem, which may be binned.
-        binned = lambda view: eqx.tree_at(lambda i: i.sensor, view.imager, self.imager.sensor)
-        of_type = lambda view: BackprojectionOperator(binned(view), self.grid, distortion=view.distortion)
-        pairs = [(of_type(view), view.weight) for view in self.back_projections]
-        if len(pairs) == 1:
-            return UnmatchedAdjointOperator(A, pairs[0][0], least_squares)
-        total = lambda image: sum(jnp.asarray(weight, image.dtype) * B.mv(image) for B, weight in pairs)
-        return UnmatchedAdjointOperator(A, lx.FunctionLinearOperator(total, A.out_structure()), least_squares)
+        kept = None if self.kept is None else jnp.asarray(self.kept)
+        # Not functions, which lineax would trace here: tables are traced once.
+        least_squares = _Images(A, self) if self.detrend_modes or self.kept is not None else A
+        if self.back_projections is not None:
+            shown = A if self.kept is None else _Images(A, dataclasses.replace(self, detrend_modes=0))
+            return UnmatchedAdjointOperator(shown, _BackProjections(A, self), least_squares, kept)
+        return least_squares if kept is None else UnmatchedAdjointOperator(least_squares, least_squares.T, None, kept)
 
-    def detrend(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
+    def detrend(self, image: Any) -> Any:
         """Project the low cosine modes out of the image, so that least squares fit a smooth background, too."""
-        image = jnp.asarray(image)
         if not self.detrend_modes:
             return image
         rows, columns = (_cosine_modes(n, self.detrend_modes, image.dtype) for n in image.shape)
         return image - rows @ (rows.T @ image @ columns) @ columns.T
 
 
+class _Images(lx.AbstractLinearOperator):
+    """Images of the kept pixels, without the low modes that least squares leave out."""
+
+    operator: ImagingOperator
+    problem: InverseProblem
+    transpose, as_matrix = transpose, as_matrix
+
+    def mv(self, vector) -> Any:
+        image = self.problem.detrend(self.operator.mv(vector))
+        return image if self.problem.kept is None else jnp.asarray(self.problem.kept, image.dtype) * image
+
+    def in_structure(self):
+        return self.operator.in_structure()
+
+    def out_structure(self):
+        return self.operator.out_structure()
+
+
+class _BackProjections(_Images):
+    """Back-projections of the kept pixels by each type of lens, weighted."""
+
+    def mv(self, vector) -> Any:
+        kept, imager, grid = self.problem.kept, self.problem.imager, self.problem.grid
+        image = vector if kept is None else jnp.asarray(kept, vector.dtype) * vector
+        volume = 0
+        for view in self.problem.back_projections or ():
+            # With the pixels of this problem, which may be binned.
+            binned = eqx.tree_at(lambda i: i.sensor, view.imager, imager.sensor)
+            part = BackprojectionOperator(binned, grid, distortion=view.distortion).mv(image)
+            volume = part if view.weight is None else volume + jnp.asarray(view.weight, part.dtype) * part
+        return volume
+
+    def in_structure(self):
+        return self.operator.out_structure()
+
+    def out_structure(self):
+        return self.operator.in_structure()
+
+
+for _class in (_Images, _BackProjections):
+    no_structure(_class)
+
+
 def _cosine_modes(size, count, dtype):
     """Lowest modes of the discrete cosine transform, orthonormal: `(size, count)`."""
     modes = np.cos(np.pi * (np.arange(size)[:, None] + 0.5) * np.arange(min(count, size)) / size)
-    return jnp.asarray(modes / np.linalg.norm(modes, axis=0), dtype)
+    return np.asarray(modes / np.linalg.norm(modes, axis=0), dtype)
 
 
 def num_detrend_modes(imager: Imager, optics: Optics) -> int:

@@ -20,7 +20,7 @@ from ..projection.backprojection import backproject, backproject_on_all_devices
 from ..projection.forward_model import FIDELITIES, Optics
 from ..solvers.base import check_solver
 from ..solvers.richardson_lucy import RichardsonLucy
-from ..solvers.stepping import run_solver, start_solver, take_step
+from ..solvers.stepping import estimate_of, run_solver, start_solver, take_step
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
@@ -257,7 +257,7 @@ class Reconstructor(eqx.Module):
         """The volume of a state."""
         if isinstance(self.method, BackProjection):
             return self._backproject(self.method, state.light, progress or Progress())
-        return self._solver(state).estimate(state.solver)
+        return estimate_of(self.method, state.solver)
 
     def run(self, state: State, progress: Progress) -> State:
         """Take all steps, or until the method converges or meets the target; overwrites the state of the solver."""

@@ -12,6 +12,7 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import Optics
+from ..solvers.stepping import estimate_of
 from ..solvers.surface import RESTARTED_STEPS, State, Surface, depth_of_sheets, restarted
 from ..typing import Image, Volume
 from .pipeline import Reconstructor, check_call
@@ -154,5 +155,5 @@ def _maps(reconstructor: Reconstructor, state: State) -> SurfaceFit:
     free, error = (float(part) for part in state.errors)
     places = (np.interp(planes, np.arange(depths.size), depths), step * sd)
     depth, depth_sd = (np.where(dark, np.nan, part).astype(np.float32) for part in places)
-    volume = np.asarray(Surface().estimate(state), np.float32)
+    volume = np.asarray(estimate_of(Surface(), state), np.float32)
     return SurfaceFit(brightness, depth, depth_sd, volume, error, free, error)

@@ -5,6 +5,7 @@ import math
 from typing import Any, NamedTuple
 
 import jax
+from jax import lax
 
 from ..base.progress import Progress
 
@@ -61,12 +62,23 @@ def _for_one_step(solver):
 
 
 @jax.jit
+def estimate_of(solver: Any, state: Any) -> Any:
+    """`solver.estimate`, by one compiled program."""
+    return solver.estimate(state)
+
+
+@jax.jit
 def _init(solver, light, problem):
-    return solver.init(getattr(problem, "operator", problem), light)
+    return _strong(solver.init(getattr(problem, "operator", problem), light))
 
 
 def _take_step(state, solver, light, problem):
-    return solver.step(getattr(problem, "operator", problem), light, state)
+    return _strong(solver.step(getattr(problem, "operator", problem), light, state))
+
+
+def _strong(state):
+    # A number of a weak type at first, and of a strong one after a step, would compile the step twice.
+    return jax.tree.map(lambda leaf: lax.convert_element_type(leaf, leaf.dtype), state)
 
 
 _step, _step_in_place = jax.jit(_take_step), jax.jit(_take_step, donate_argnums=0)

@@ -243,7 +243,6 @@ class Surface(eqx.Module):
         # Steps of different kinds have no common residual: none ends the schedule early.
         return state._replace(number=state.number + 1), misfit, jnp.ones((), light.dtype)
 
-    @eqx.filter_jit
     def estimate(self, state: State) -> Float[Array, "depth y x"]:
         is_start = state.number < _FIRST
         return lax.cond(is_start, lambda: state.lucy.x, lambda: volume_of(state.sheets, state.lucy.x.shape[0]))
