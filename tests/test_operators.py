@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import lsmr
 
 from gs_jax import BackprojectionOperator, ImagingOperator, backproject, backproject_adjoint, psf_model
+from gs_jax.base.errors import InputError
 from gs_jax.interop import as_deepinv, as_scico, as_scipy
 
 from .helpers import scene
@@ -29,6 +30,16 @@ def test_transpose_is_backprojection():
     expected = np.asarray(backproject(image, imager, grid))
     np.testing.assert_allclose(A.T.mv(image), expected, rtol=1e-12, atol=1e-14 * np.abs(expected).max())
     np.testing.assert_array_equal(A.T.T.mv(volume), A.mv(volume))
+    # Integers and half precision are numbers of the operator's type; what is imaginary would be lost.
+    counts = np.asarray(np.abs(10 * image), np.uint8)
+    for numbers in (counts, counts.astype(np.float16)):
+        np.testing.assert_array_equal(A.T.mv(numbers), A.T.mv(counts.astype(float)))
+    half = backproject(counts.astype(np.float16), imager, grid)
+    assert half.dtype == image.dtype
+    np.testing.assert_allclose(half, backproject(counts.astype(float), imager, grid), rtol=1e-12, atol=1e-12)
+    for call in (A.T.mv, lambda wrong: backproject(wrong, imager, grid)):
+        with pytest.raises(InputError, match="must be real, got complex128"):
+            call(np.asarray(image) * 1j)
 
 
 @pytest.mark.integration

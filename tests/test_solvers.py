@@ -16,6 +16,7 @@ from skimage.restoration import denoise_tv_chambolle, richardson_lucy as of_skim
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.projection.measured_psf import ConvolutionOperator
+from gs_jax.reconstruction.methods import PinholeRichardsonLucy
 from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, shrink, solve, total_variation
 from gs_jax.solvers.convolution import ConvolutionADMM
@@ -362,6 +363,14 @@ def test_wrong_arguments_are_named(solver):
         ADMM(sparsity=float("nan"))
     with pytest.raises(InputError, match="background_knots must be 0, or 2 or more, got 1"):
         RichardsonLucy(background_knots=1)
+    wrong: Any = FISTA
+    with pytest.raises(InputError, match="solver must be an object such as FISTA"):
+        solve(dense(), jnp.zeros(30), wrong)
+    with pytest.raises(InputError, match="image must be real, got complex"):
+        solve(dense(), jnp.zeros(30, complex), SOLVERS[solver](steps=1))
+    for other in (ConvolutionADMM(), PinholeRichardsonLucy()):
+        with pytest.raises(InputError, match="must be used with"):
+            solve(dense(), jnp.zeros(30), other)
     with pytest.raises(InputError, match="image must be 2-D .*, got 1-D"):
         solve(dense(), jnp.zeros(30), RichardsonLucy(background_knots=2))
 

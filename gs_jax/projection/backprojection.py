@@ -9,7 +9,7 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import jit
+from ..base.arrays import check_real, jit
 from ..geometry import Imager
 from ..grid import Grid
 from ..typing import Image
@@ -56,12 +56,13 @@ def backproject(
     Returns
     -------
     Array
-        `grid.volume_shape`, of the image's type if that is floating, else of the imager's.
+        `grid.volume_shape`, of the image's type if that is float32 or float64, else of the imager's.
 
     Raises
     ------
     ValueError
-        If the image is not `sensor.shape`, `method` is unknown, or there is not one distortion for each depth.
+        If the image is not `sensor.shape` or complex, `method` is unknown, or there is not one distortion for each
+        depth.
 
     Examples
     --------
@@ -183,7 +184,10 @@ def as_volume(volume: Num[Array | np.ndarray, "*shape"], imager: Imager) -> Floa
 
 
 def _type_of(array, imager):
-    return array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else imager.sensor_distance.dtype
+    """The array's own type, if it is precise enough for the places of pixels; otherwise the imager's."""
+    check_real("image or volume", array)
+    precise = jnp.issubdtype(array.dtype, jnp.floating) and array.dtype.itemsize >= 4
+    return array.dtype if precise else imager.sensor_distance.dtype
 
 
 def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group size"]:

@@ -2,11 +2,12 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import native
+from ..base.arrays import check_real, native
 from ..geometry import Imager
 from ..grid import Grid
 from .backprojection import backproject
@@ -127,8 +128,10 @@ class Transposed(lx.AbstractLinearOperator):
 
     operator: lx.AbstractLinearOperator
 
-    def mv(self, vector: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-        return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(native(vector))[0]
+    def mv(self, vector: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
+        check_real("vector", vector)
+        vector = jnp.asarray(native(vector), self.operator.out_structure().dtype)
+        return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)[0]
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return self.operator.out_structure()
