@@ -160,7 +160,9 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
     key = (repr((structure, request.grid, request.rings)).encode(), *leaves)
     arrays = cached_on_disk(key, lambda: _trace_tables(request))
     rings = tuple(arrays.pop("rings").tolist())
-    tables = {name: jnp.asarray(array, request.imager.sensor_distance.dtype) for name, array in arrays.items()}
+    dtype = request.imager.sensor_distance.dtype
+    # Not `jnp.asarray`, which compiles a program for each shape.
+    tables = {name: jax.device_put(np.asarray(array, dtype)) for name, array in arrays.items()}
     stray_light = StrayLight.on(request.grid, tables["table"], tables["area"], tables["sensor_distance"])
     names = "distortion", "light", "kernels", "wide_kernels", "harmonics", "wide_harmonics"
     return FieldVaryingPsf(**{name: tables[name] for name in names}, stray_light=stray_light, rings=rings)
@@ -232,7 +234,7 @@ def trace_stray_light(
     each = zip(depths, map(PsfCores, *cores), strict=True)
     tables = map_in_threads(lambda one: stray_light_table(imager, one[0], aperture, grid, one[1], ends), each)
     tracked = zip((progress or Progress()).track(depths, "Tracing stray light"), tables, strict=True)
-    table = jnp.asarray(np.stack([table for _, table in tracked]), imager.sensor_distance.dtype)
+    table = jax.device_put(np.stack([table for _, table in tracked]).astype(imager.sensor_distance.dtype))
     return StrayLight.on(grid, table, jnp.mean(clear_area(imager.array)), imager.reduced_sensor_distance)
 
 

@@ -125,7 +125,7 @@ class Entries(eqx.Module):
         parts, order = _equal_parts(start, place, share)
         # Tables are kept: they must not belong to a program that is being traced.
         with jax.ensure_compile_time_eval():
-            own = jax.tree.map(jnp.asarray, (start, place, share, parts, order))
+            own = jax.device_put((start, place, share, parts, order))
         return cls(own[0], own[1], own[2], own[3], own[4], columns)
 
 
