@@ -218,7 +218,7 @@ class MicrolensArray(eqx.Module):
         return dataclasses.replace(self, centers=centers, others=others, types=None, **numbers)
 
     @property
-    def focal_length(self) -> Float[Array, "*type"]:
+    def focal_length(self) -> Scalars:
         """Focal length in air, `R / (n - 1)` for a plano-convex lens, mm; of each type where lenses differ."""
         if self.thin_lens_focal_length is None:
             return self.radius_of_curvature / (self.refractive_index - 1)

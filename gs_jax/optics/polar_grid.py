@@ -109,8 +109,8 @@ class Entries(eqx.Module):
     start: Int[Array, " start"]
     place: Int[Array, " entry"]
     share: Float[Array, " entry"]
-    parts: list[tuple[Int[Array, "row size"], Float[Array, "row size"]]]
-    order: Int[Array, " row"]
+    parts: list[tuple[Int[Array, "_ _"], Float[Array, "_ _"]]]
+    order: Int[Array, " _"]
     columns: int = eqx.field(static=True)
 
     @classmethod
