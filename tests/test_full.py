@@ -422,6 +422,7 @@ def test_a_model_of_other_planes_pixels_or_objects_is_refused():
     for user in (
         lambda: ImagingOperator(wide, voxels, near),
         lambda: reconstruct(np.ones(scope.sensor.shape), wide, voxels, RichardsonLucy(2), optics=near),
+        lambda: reconstruct(np.ones(scope.sensor.shape), wide, voxels, optics=near),
     ):
         with pytest.raises(InputError, match="sensor's pixels of 500 um, got"):
             user()

@@ -17,7 +17,7 @@ from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject, backproject_on_all_devices
-from ..projection.forward_model import FIDELITIES, Optics
+from ..projection.forward_model import FIDELITIES, Optics, check_optics
 from ..solvers.base import check_solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.stepping import estimate_of, run_solver, start_solver, take_step
@@ -203,6 +203,8 @@ class Reconstructor(eqx.Module):
         _check(method, optics)
         check_stop(method, stop_at_discrepancy)
         depths, by_name = np.asarray(grid.depths), isinstance(optics, str)
+        if not by_name:
+            check_optics(optics, imager, grid)
         check_beyond(imager, depths, "grid: depths")
         if isinstance(method, Surface) and not (np.diff(depths) > 0).all():
             raise InputError(f"grid: depths must ascend with Surface(), got {short_repr(depths.tolist())}.")
