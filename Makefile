@@ -46,13 +46,15 @@ test-napari: .venv-napari/test
 test-lowest: .venv-lowest/test
 	NUMBA_CACHE_DIR=$(CURDIR)/.venv-lowest/numba JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(LOWEST) -m pytest $(SHORT)
 
-# What is newest changes from day to day.
+# What is newest changes from day to day. `NIGHTLY` is an index of JAX's nightly wheels.
+NIGHTLY ?=
 test-newest:
 	@python=$$(.ci/newest-python); \
 	if [ -z "$$python" ]; then echo "test-newest: skipped, no Python newer than 3.11 is at hand"; exit; fi; \
 	set -ex; \
 	"$$python" -m venv .venv-newest; \
 	$(NEWEST) -m pip install --quiet --upgrade --upgrade-strategy eager --editable '.[test]'; \
+	if [ -n "$(NIGHTLY)" ]; then $(NEWEST) -m pip install --quiet --upgrade --pre jax jaxlib --extra-index-url "$(NIGHTLY)"; fi; \
 	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(NEWEST) -m pytest $(SHORT)
 
 lint: .venv/dev
@@ -65,12 +67,16 @@ docs: .venv/docs
 	$(BIN)/mkdocs build --strict --quiet --config-file docs/mkdocs.yml
 	@echo "out/docs/site/index.html"
 
-# The wheel is tried where nothing else is: not the checkout, not its environment.
+# The wheel is tried where nothing else is: not the checkout, not its environment, and at first none of the extras.
 dist: .venv/dist
 	rm -rf dist .venv-wheel
 	$(BIN)/python -m build --outdir dist
 	$(PYTHON) -m venv .venv-wheel
-	.venv-wheel/bin/python -m pip install --quiet "$$(ls dist/*.whl)[all]"
+	.venv-wheel/bin/python -m pip install --quiet dist/*.whl
+	cd / && $(CURDIR)/.venv-wheel/bin/python -c "import gs_jax; [getattr(gs_jax, name) for name in gs_jax.__all__]"
+	.venv-wheel/bin/python -m pip install --quiet "$$(ls dist/*.whl)[all]" pyright
+	cd / && { $(CURDIR)/.venv-wheel/bin/pyright --pythonpath $(CURDIR)/.venv-wheel/bin/python --verifytypes gs_jax \
+		--ignoreexternal || true; } | grep "completeness"
 	cd / && $(CURDIR)/.venv-wheel/bin/gs-jax demo --out $(CURDIR)/out/wheel
 
 .venv/core: pyproject.toml
