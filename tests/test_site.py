@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 import click
+import jax
 import pytest
 
 import gs_jax as gs
@@ -35,7 +36,8 @@ def module(path: Path):
 
 
 def blocks(path: Path, language: str = "") -> list[str]:
-    return re.findall(rf"^ *```{language}\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    found = re.findall(r"^ *```(\w*)\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    return [text for name, text in found if name == language]
 
 
 def relative(path: Path) -> str:
@@ -64,6 +66,7 @@ def test_links_exist(path):
 # Commands that a page must show, among others.
 SHOWN = {
     "design/LAB.md": {"new-design", "calibrate", "reconstruct", "metrics", "simulate", "info"},
+    "docs/howto/own_numbers.md": {"new-design", "metrics", "optimize", "simulate", "report", "tolerance", "mold", "mask"},
     "design/CLUSTER.md": {"reconstruct", "optimize", "pareto", "train"},
 }
 
@@ -97,8 +100,9 @@ def test_names_of_the_package_exist(path):
 def test_python_of_a_page_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": name}
-    for block in blocks(DOCS / "howto" / f"{name}.md", "python"):
-        exec(compile(block, name, "exec"), names)
+    with jax.numpy_dtype_promotion("standard"):  # as users have it
+        for block in blocks(DOCS / "howto" / f"{name}.md", "python"):
+            exec(compile(block, name, "exec"), names)
 
 
 @pytest.mark.integration
@@ -130,9 +134,10 @@ def test_python_of_the_python_page_runs(tmp_path):
     assert (tmp_path / "volume.png").exists()
 
 
-def test_study_of_the_first_ten_minutes_is_valid():
-    (study,) = blocks(DOCS / "start.md", "toml")
-    assert Study.model_validate(tomllib.loads(study)).name == "focused"
+@pytest.mark.parametrize("page, name", [("start", "focused"), ("howto/own_numbers", "mine")])
+def test_study_of_a_page_is_valid(page, name):
+    (study,) = blocks(DOCS / f"{page}.md", "toml")
+    assert Study.model_validate(tomllib.loads(study)).name == name
 
 
 def test_layers_of_the_page_of_samples_are_valid():
@@ -201,5 +206,5 @@ def test_workflows_call_existing_targets():
         path.stem: set(re.findall(r"run: make (\S+)", path.read_text(encoding="utf-8")))
         for path in (ROOT / ".github" / "workflows").glob("*.yml")
     }
-    assert set(calls) == {"tests", "docs", "wheels"} and all(calls.values())
+    assert set(calls) == {"tests", "docs", "nightly", "wheels"} and all(calls.values())
     assert set().union(*calls.values()) <= targets
