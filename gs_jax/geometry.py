@@ -15,7 +15,17 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .base.arrays import FINITE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields, native
+from .base.arrays import (
+    FINITE,
+    POSITIVE,
+    Rule,
+    array_namespace,
+    as_float,
+    as_float_or_none,
+    check_fields,
+    native,
+    one_program,
+)
 from .base.errors import input_error
 from .grid import Sensor
 from .layers import (
@@ -175,6 +185,7 @@ class Imager(eqx.Module):
         check_room(self.sensor_distance, self.filters, self.windows, self.sample, self.array.orientation)
 
     @property
+    @one_program
     def centers(self) -> Scalars:
         """Lens vertices `(lens, 2)` in the sensor's frame, mm.
 
@@ -188,6 +199,7 @@ class Imager(eqx.Module):
         return centers - (centers @ self.tilt)[:, None] * self.tilt[None] * (cosine**2 / (1 + cosine))
 
     @property
+    @one_program
     def heights(self) -> Scalars:
         """Heights `(lens,)` of the vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
         if self.tilt is None:
@@ -238,6 +250,7 @@ class Imager(eqx.Module):
         assert self.tilt is not None
         return 1 / array_namespace(self.tilt).sqrt(1 + (self.tilt**2).sum())
 
+    @one_program
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Reduced depth `z'` from the object to the lens vertices, mm.
 
@@ -254,6 +267,7 @@ class Imager(eqx.Module):
         """
         return object_index(self.sample) * self.reduced_depth(depth)
 
+    @one_program
     def depth_of(self, reduced_depth: Scalars) -> Scalars:
         """Depth `z` of a reduced depth `z'`, mm."""
         return depth_of_reduced(reduced_depth - self.array.reduced_thickness_front, self.filters, self.sample)
@@ -268,6 +282,7 @@ class Imager(eqx.Module):
         return zero + object_surface(self.filters, self.sample)
 
     @property
+    @one_program
     def reduced_sensor_distance(self) -> Scalar:
         """Reduced distance `v'` from the lens vertices to the sensor: `v`, or `v + t/n` with the plate behind.
 
@@ -285,6 +300,7 @@ class Imager(eqx.Module):
         plate = self.array.reduced_thickness_back
         return plate if self.windows is None else plate - self.windows.shortening
 
+    @one_program
     def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Lateral magnification `M_z = v'/z'` (Eq. 3)."""
         return self.reduced_sensor_distance / self.reduced_depth(depth)
@@ -342,6 +358,7 @@ class Imager(eqx.Module):
         """Scale of the array's pattern on the sensor, `s_z = (z' + v') / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)
 
+    @one_program
     def views(
         self,
         points: Float[Array | np.ndarray, "*#view 3"],
@@ -383,6 +400,7 @@ class Imager(eqx.Module):
         """Spot of each point `(x, y, z)` under each lens, `(lens, point, 2)`, mm on the sensor."""
         return self.views_of_all(points).spot
 
+    @one_program
     def brightness(self, views: Views) -> Scalars:
         """The envelope C of views."""
         return envelope((views.offset**2).sum(-1), views.reduced_depth, self.field_radius)

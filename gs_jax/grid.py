@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from .base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields
+from .base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields, one_program
 
 
 class Sensor(eqx.Module):
@@ -67,6 +67,7 @@ class Sensor(eqx.Module):
         column = (points[..., 0] - self.origin[0]) / self.pixel_pitch + middle_column
         return (np if isinstance(points, np.ndarray) else jnp).stack([row, column], axis=-1)
 
+    @one_program
     def to_mm(self, pixels: Num[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
@@ -145,11 +146,13 @@ class Grid(eqx.Module):
         return self.depths.size, *self.shape
 
     @property
+    @one_program
     def y(self) -> Float[Array, " row"]:
         """Voxel centres along the rows' axis, mm."""
         return self.origin[1] + self._offsets(self.shape[0])
 
     @property
+    @one_program
     def x(self) -> Float[Array, " column"]:
         """Voxel centres along the columns' axis, mm."""
         return self.origin[0] + self._offsets(self.shape[1])

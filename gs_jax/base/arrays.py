@@ -63,6 +63,25 @@ def _check_no_nan(module: Any) -> None:
             raise InputError(f"{name} must be numbers, got {np.count_nonzero(np.isnan(np.asarray(leaf)))} NaN.")
 
 
+def one_program(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Compile a method of a module, unless JAX traces it or its numbers are NumPy's.
+
+    Operation by operation JAX would compile a program for each of them, and again for each shape.
+    """
+    compiled: Any = jax.jit(function)
+
+    @functools.wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        numbers = jax.tree.leaves(args[0])
+        on_host = bool(numbers) and all(isinstance(number, np.ndarray | np.generic) for number in numbers)
+        if on_host or is_traced((args, kwargs)):
+            return function(*args, **kwargs)
+        args, kwargs = native((args, kwargs))
+        return compiled(*args, **kwargs)
+
+    return call
+
+
 def array_namespace(x: Any) -> Any:
     """Return `numpy` for a NumPy array, otherwise `jax.numpy`."""
     return np if isinstance(x, np.ndarray) else jnp
