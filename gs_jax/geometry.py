@@ -273,6 +273,7 @@ class Imager(eqx.Module):
         return depth_of_reduced(reduced_depth - self.array.reduced_thickness_front, self.filters, self.sample)
 
     @property
+    @one_program
     def sample_surface(self) -> Scalar:
         """Depth at which the object's medium begins, mm: the sample's surface, or where filters end.
 
@@ -290,6 +291,7 @@ class Imager(eqx.Module):
         """
         return self.sensor_distance + self._behind
 
+    @one_program
     def sensor_distance_of(self, reduced_distance: Scalars) -> Scalars:
         """Sensor distance `v` of a reduced distance `v'`, mm."""
         return reduced_distance - self._behind
@@ -320,6 +322,7 @@ class Imager(eqx.Module):
         v = self.reduced_sensor_distance
         return magnification * (v + height) / (v - height / tilted_index(self.sample) * magnification)
 
+    @one_program
     def axis_offset(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Offset of a lens's axis, which is normal to the array, from its vertex at a depth, mm, `(*batch, 2)`."""
         return self._per_slope(-self._reduced_and_shortened(depth))
@@ -345,15 +348,18 @@ class Imager(eqx.Module):
         return -self.axis_offset(depth) - self._per_slope(self.reduced_depth(depth) / distortion)
 
     @property
+    @one_program
     def spot_displacement(self) -> Scalars:
         """Displacement of all spots by a plate behind the vertices that tilts with them, mm, `(2,)`."""
         return self._per_slope(self.array.reduced_thickness_back * (self.array.refractive_index - 1))
 
     @property
+    @one_program
     def image_of_axis(self) -> Scalars:
         """Offset on the sensor of the image of a lens's axis from its vertex, mm, `(2,)`."""
         return self._per_slope(self.reduced_sensor_distance) + self.spot_displacement
 
+    @one_program
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Scale of the array's pattern on the sensor, `s_z = (z' + v') / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)

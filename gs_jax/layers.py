@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .base.arrays import NOT_NEGATIVE, array_namespace, as_float, as_float_or_none, check_fields
+from .base.arrays import NOT_NEGATIVE, array_namespace, as_float, as_float_or_none, check_fields, one_program
 from .lenses import INDEX
 from .typing import Scalar, Scalars
 
@@ -50,11 +50,13 @@ class Layers(eqx.Module):
         check_fields(self, thickness=NOT_NEGATIVE, refractive_index=INDEX)
 
     @property
+    @one_program
     def total(self) -> Scalar:
         """Thickness of all layers, mm."""
         return self.thickness.sum()
 
     @property
+    @one_program
     def shortening(self) -> Scalar:
         """By how much the reduced thickness is below the thickness, `sum t (1 - 1/n)`, mm."""
         return (self.thickness * (1 - 1 / self.refractive_index)).sum()

@@ -12,7 +12,17 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .base.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields
+from .base.arrays import (
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Rule,
+    array_namespace,
+    as_float,
+    as_float_or_none,
+    check_fields,
+    one_program,
+)
 from .base.errors import InputError
 from .typing import Scalar, Scalars
 
@@ -225,17 +235,20 @@ class MicrolensArray(eqx.Module):
         return self.thin_lens_focal_length
 
     @property
+    @one_program
     def reduced_thickness_front(self) -> Scalar:
         """Reduced thickness `t/n` of the plate in front of the vertices, mm; 0 if the curved side is in front."""
         reduced = self.substrate_thickness / self.refractive_index
         return reduced if self.orientation == "plano" else 0 * reduced
 
     @property
+    @one_program
     def reduced_thickness_back(self) -> Scalar:
         """Reduced thickness `t/n` of the plate behind the vertices, mm."""
         return self.substrate_thickness / self.refractive_index - self.reduced_thickness_front
 
     @property
+    @one_program
     def departure(self) -> Scalar:
         """Coefficient of `r^4` in the departure from a sphere, `k / (8 R^3) + A_4`, 1/mm^3."""
         departure = self.conic_constant / (8 * self.radius_of_curvature**3)
