@@ -28,13 +28,19 @@ class Group(NamedTuple):
     def text(self) -> str:
         """Markdown of the page, for mkdocstrings."""
         names = "\n\n".join(f"::: gs_jax.{name}" for name in self.names)
-        return f"# {self.title}\n\n{names}\n"
+        return f"# {self.title}\n\n{set_up()}\n\n{names}\n"
 
 
 def groups() -> list[Group]:
     """Groups of public names, in the order of the package's docstring."""
     matches = _GROUP.findall(gs_jax.__doc__ or "")
     return [Group(title, [line.split()[0] for line in lines.splitlines()]) for title, lines in matches]
+
+
+def set_up() -> str:
+    """The end of the package's docstring: what the examples of all names start from, as Markdown."""
+    text, code = (gs_jax.__doc__ or "").rstrip().split("\n\n")[-2:]
+    return f"{text}\n\n```python\n{code}\n```"
 
 
 def public() -> Iterator[tuple[str, object]]:

@@ -87,6 +87,14 @@ Around all:
     Progress             Progress on standard error: bars on a terminal, otherwise a line every ten seconds
     InputError           Wrong input from a user, explained in one line
 
+Examples start from three lenses in front of 200 x 200 pixels, and the image of a point:
+
+>>> import gs_jax as gs, numpy as np
+>>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+>>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+>>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+>>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+>>> image = gs.simulate(point, scope, optics="near", psf="geometric")
 """
 
 import lazy_loader

@@ -49,7 +49,6 @@ def quality(estimate: Volume, truth: Volume) -> Quality:
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> truth = np.zeros((3, 32, 32))
     >>> truth[1, 10:20, 12:15] = 1.0
     >>> noisy = 5 * truth + np.random.default_rng(0).normal(0, 0.1, truth.shape)
@@ -102,7 +101,6 @@ def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: f
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> truth = np.array([[0.0, 0.0, 20.0], [1.0, 0.0, 20.0]])
     >>> found = np.array([[0.003, 0.004, 20.02], [5.0, 5.0, 20.0]])  # one is near, one is a ghost
     >>> score = gs.localization(found, truth)

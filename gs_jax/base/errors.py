@@ -25,7 +25,6 @@ class InputError(ValueError):
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> try:
     ...     gs.read_design("missing.toml")
     ... except gs.InputError as error:

@@ -36,7 +36,6 @@ class Progress:
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> with gs.Progress() as progress:  # prints to standard error while work takes long
     ...     for _ in progress.track(range(3), "Counting"):
     ...         pass

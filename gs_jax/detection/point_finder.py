@@ -119,7 +119,6 @@ def find_points(
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> array = gs.MicrolensArray(gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
     >>> scope = gs.Imager(array, gs.Sensor((900, 900), 0.009), sensor_distance=5.8, field_radius=3.0)
     >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)

@@ -162,7 +162,6 @@ def suppress(volume: Float[Array | np.ndarray, "depth y x"], network: UNet | Non
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> volume = np.random.default_rng(0).random((3, 64, 64)) + 5.0  # background alone
     >>> clean = gs.suppress(volume)
     >>> clean.shape, bool(clean.min() >= 0)

@@ -123,7 +123,6 @@ def deconvolve(
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> psf = np.zeros((33, 33))
     >>> psf[16, [8, 16, 26]] = 1.0  # three spots for each point
     >>> image = np.zeros((64, 64))

@@ -34,11 +34,6 @@ class BackProjection(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
     >>> volume = gs.reconstruct(np.ones((200, 200)), scope, grid, gs.BackProjection(normalize=True))
     >>> print(round(float(volume[1, 20, 20]), 3))
     1.0
@@ -64,13 +59,6 @@ class PinholeRichardsonLucy(RichardsonLucy):
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
-    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
-    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
     >>> volume = gs.reconstruct(image, scope, grid, gs.PinholeRichardsonLucy(steps=3), optics="near")
     >>> print(volume.argmax() == np.ravel_multi_index((1, 19, 22), volume.shape))
     True

@@ -103,7 +103,7 @@ class RESULTS(eqx.Enumeration):
 
     Examples
     --------
-    >>> import gs_jax as gs, jax.numpy as jnp, lineax as lx
+    >>> import jax.numpy as jnp, lineax as lx
     >>> from gs_jax.solvers.base import RESULTS
     >>> A = lx.MatrixLinearOperator(jnp.ones((3, 2)))
     >>> solution = gs.solve(A, jnp.array([1.0, 1.0, jnp.nan]), gs.FISTA(), throw=False)
@@ -180,11 +180,6 @@ def solve(
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
     >>> image = gs.forward(np.ones(grid.volume_shape), scope, grid)
     >>> solution = gs.solve(gs.ImagingOperator(scope, grid), image, gs.RichardsonLucy(steps=5))
     >>> solution.value.shape, solution.stats["costs"].shape

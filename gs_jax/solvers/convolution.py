@@ -112,7 +112,6 @@ class ConvolutionADMM(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> stack = np.zeros((2, 20, 30))
     >>> stack[0, 10, 15] = stack[1, 10, 5] = stack[1, 10, 25] = 1.0
     >>> A = gs.ConvolutionOperator(stack)

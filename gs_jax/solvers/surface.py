@@ -122,13 +122,6 @@ class Surface(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
-    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
-    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
     >>> volume = gs.reconstruct(image, scope, grid, gs.Surface(), optics="near")
     >>> volume.shape
     (3, 41, 41)
