@@ -24,7 +24,7 @@ from gs_jax import Grid
 from gs_jax.apps.method_benchmark import timed
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
-from gs_jax.detection.particles import find_clusters
+from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality

@@ -38,7 +38,7 @@ from gs_jax.apps.method_benchmark import render_points, timed
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
-from gs_jax.detection.particles import find_clusters
+from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture

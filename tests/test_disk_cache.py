@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs_jax.base import disk_cache
-from gs_jax.base.disk_cache import cached_on_disk
-from gs_jax.base.value_cache import cache_by_value
+from gs_jax.base import caches
+from gs_jax.base.caches import cache_by_value, cached_on_disk
 
 
 class Counted:
@@ -65,7 +64,7 @@ def test_files_that_were_not_read_for_longest_are_removed(folder, monkeypatch):
     compute = Counted()
     cached_on_disk([b"x"], compute)
     size = next(folder.iterdir()).stat().st_size
-    monkeypatch.setattr(disk_cache, "_MOST_BYTES", 2.5 * size)
+    monkeypatch.setattr(caches, "_MOST_BYTES", 2.5 * size)
     cached_on_disk([b"y"], compute)
     for age, file in enumerate(folder.iterdir()):
         os.utime(file, (1e9 - age, 1e9 - age))

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from gs_jax.base.machine import map_in_threads
+from gs_jax.base.workers import map_in_threads
 
 
 def test_results_are_in_the_order_of_the_items():

@@ -178,7 +178,7 @@ def test_stacks_are_kept(tmp_path):
 def test_stacks_of_other_specs_are_not_read(tmp_path, monkeypatch):
     """Nor of another seed, number or version of the package."""
     names = {_path(tmp_path, *key).name for key in ((5, 1, TINY), (5, 2, TINY), (6, 1, TINY), (5, 1, SPECS))}
-    monkeypatch.setattr("gs_jax.base.disk_cache._source", lambda: b"another version")
+    monkeypatch.setattr("gs_jax.base.caches._source", lambda: b"another version")
     assert len(names | {_path(tmp_path, 5, 1, TINY).name}) == 5
     # Of two specs in turn the second stack is of the same one as alone.
     two = _path(tmp_path, 5, 1, (*TINY, *SPECS)).name

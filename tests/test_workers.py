@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from gs_jax.base.errors import InputError
-from gs_jax.base.machine import Workers
+from gs_jax.base.workers import Workers
 from gs_jax.io.volume_series import JOURNAL
 
 from .test_cli import folder, run
@@ -116,7 +116,7 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{nobody.getsockname()[1]}"
-        monkeypatch.setattr("gs_jax.base.machine._ANSWER", 0.5)
+        monkeypatch.setattr("gs_jax.base.workers._ANSWER", 0.5)
         for options, words in (
             (
                 ("--scheduler", address),
@@ -189,7 +189,7 @@ def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, ca
     before = numbers()
     # What it says that it has is there.
     assert len(before) >= 3 and volumes()[before].any((1, 2, 3)).all()
-    monkeypatch.setattr("gs_jax.base.machine._ANSWER", 60)
+    monkeypatch.setattr("gs_jax.base.workers._ANSWER", 60)
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
         arguments = command("rec.tif", "--resume", "--scheduler", cluster.scheduler_address)
         status, out, _ = run(monkeypatch, capsys, *arguments)

@@ -1,1 +1,1 @@
-"""What everything stands on: errors, progress, numbers that stay finite, and what the machine is."""
+"""Shared utilities: errors, progress, safe arithmetic, caches, the machine and workers."""

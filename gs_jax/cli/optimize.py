@@ -5,8 +5,8 @@ from pathlib import Path
 import click
 
 from ..base.errors import InputError
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.files import check_output, checkpoint_path, make_folder, write_json
 from .options import DESIGN, terms_option, worker_options
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of

@@ -14,7 +14,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from ..base.machine import Workers
+from ..base.workers import Workers
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MAX_DEPTHS = 10_000

@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from ..base.errors import InputError, needs_extra
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.files import check_output
 from .light import Light, light_options, objects_in
 from .options import (
@@ -163,7 +163,7 @@ def reconstruct_command(
     if points:
         check_output(points, [".csv"])
     if track:
-        from ..detection.particles import import_linker
+        from ..detection.linking import import_linker
 
         if not points:
             raise InputError("--track must be used with --points POINTS.csv, which has the particles.")

@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from ..base.errors import InputError, InputWarning
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from .light import objects_in
 from .options import UM, CaptureOptions, Number, depth_range
 from .outputs import RESUMABLE, partial_outputs, provenance_of
@@ -238,7 +238,7 @@ def request_of(provenance: dict[str, str], names: list[str] | None = None) -> di
 
 def write_series_points(path, series, track, provenance, frame) -> str:
     """Write the points of all frames; return their number, and that of particles, in words."""
-    from ..detection.particles import track as track_particles
+    from ..detection.linking import track as track_particles
     from ..io.point_tables import write_points_in_time
     from ..io.provenance import INTENSITY
 

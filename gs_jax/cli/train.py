@@ -7,8 +7,8 @@ from typing import Any
 import click
 
 from ..base.errors import InputError
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.files import check_output, checkpoint_path, side_file, write_json
 from .light import LIGHT_OPTIONS, Light, check_beyond, sample_options
 from .options import (

@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from ..base.errors import InputError
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..design.design import Design
 from ..typing import PathLike
 from .parameters import NAMES, Values, significant, start_values

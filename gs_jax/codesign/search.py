@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import host_code
 from ..base.errors import InputError, check_kind, errors_name_file, input_error, short_repr
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..design.conversion import reduced_depth, reduced_sensor_distance, sample_table
 from ..design.design import Design, read_design
 from ..geometry import Imager

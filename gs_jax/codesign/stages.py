@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, Key
 
 from ..base.arrays import as_float
 from ..base.errors import InputError
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..design.conversion import object_begins
 from ..design.design import Design
 from ..geometry import Imager

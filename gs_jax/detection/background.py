@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Float32, Shaped
 
 from ..base.arrays import check_finite
 from ..base.errors import input_error
-from ..base.machine import map_in_threads
+from ..base.workers import map_in_threads
 from ..typing import Image
 
 # Side of a tile with one background and one noise level, pixels: wider than a spot, narrower than haze. A band has as

@@ -17,7 +17,7 @@ from scipy.ndimage import label, map_coordinates
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
-from ..base.value_cache import cache_by_value
+from ..base.caches import cache_by_value
 from ..geometry import Imager
 from ..grid import Grid
 from ..optics.lens_types import core_width, height_bands, split_groups, type_weights

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64
 
-from ..base.disk_cache import cached_on_disk
+from ..base.caches import cached_on_disk
 from ..base.errors import InputError, short_repr
-from ..base.machine import map_in_threads
 from ..base.progress import Progress
+from ..base.workers import map_in_threads
 from ..geometry import Imager
 from .apertures import clear_area
 from .core_kernels import harmonic_shares, narrow_kernel, render_harmonics, render_kernel, sample_profile, sharpen

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Float64, Int
 
+from ..base.caches import cache_by_value
 from ..base.errors import InputWarning
-from ..base.value_cache import cache_by_value
 from ..geometry import Imager
 from ..grid import Grid
 from .apertures import clear_area

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Float64
 
 from ..base.arrays import array_namespace
-from ..base.machine import map_in_threads
 from ..base.progress import Progress
+from ..base.workers import map_in_threads
 from ..geometry import Imager, falloff
 from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil
 from .raytrace import to_numpy

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..grid import Grid
 from ..io.volume_series import Note, VolumeSeries, open_levels, write_frame
 from ..typing import Volume

@@ -14,8 +14,8 @@ from jax import lax
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ...base.errors import InputError
-from ...base.machine import Workers
 from ...base.progress import Progress
+from ...base.workers import Workers
 from ...detection.unet import UNet, multislice_network, paper_network
 from ...io.files import atomic_write, check_input, decoding
 from ...reconstruction.inverse_problem import InverseProblem, lens_type_geometries, subtract_offset

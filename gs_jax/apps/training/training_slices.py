@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float16, Float32
 from scipy.ndimage import gaussian_filter
 
-from ...base.disk_cache import digest_of
-from ...base.machine import Workers
+from ...base.caches import digest_of
 from ...base.progress import Progress
+from ...base.workers import Workers
 from ...detection.unet import standardize
 from ...io.files import atomic_write, decoding, make_folder
 from ...optics.psf_core import core_distortion

@@ -1,16 +1,21 @@
-"""Arrays that take seconds to compute, kept in the user's cache folder for the next process."""
+"""Results that take seconds: kept in memory for calls with the same values, or on disk for the next process."""
 
 import contextlib
+import functools
 import hashlib
 import os
 import sys
 import uuid
 import zipfile
 from collections.abc import Callable, Iterable
-from functools import cache
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
+import jax
 import numpy as np
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 # Of all files together; those that were not read for the longest time are removed.
 _MOST_BYTES = 2**29
@@ -66,7 +71,7 @@ def digest_of(key: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-@cache
+@functools.cache
 def _source() -> bytes:
     """A hash of the package's source: any change of it may change the arrays."""
     package = Path(__file__).parents[1]
@@ -87,3 +92,34 @@ def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
         used += file.stat().st_size
         if used > _MOST_BYTES:
             file.unlink(missing_ok=True)
+
+
+class _Call:
+    """Arguments of a call; equal if their structures, types and values are."""
+
+    def __init__(self, args, kwargs):
+        self.args, self.kwargs = args, kwargs
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        arrays = map(np.asarray, leaves)
+        self.key = structure, tuple((x.dtype, x.shape, x.tobytes()) for x in arrays)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Call) and self.key == other.key
+
+
+def cache_by_value(maxsize: int) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Keep the results of the last `maxsize` calls. Arguments are pytrees of arrays and numbers; results are shared."""
+
+    def decorate(function):
+        cached = functools.lru_cache(maxsize)(lambda call: function(*call.args, **call.kwargs))
+
+        @functools.wraps(function)
+        def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            return cached(_Call(args, kwargs))
+
+        return call
+
+    return decorate
