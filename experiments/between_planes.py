@@ -12,6 +12,7 @@ Writes `between_planes.json` and `between_planes.md`; about ten minutes on two c
 import time
 from itertools import product
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -27,15 +28,15 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.projection.operators import as_matrix, no_structure, transpose
 from gs_jax.reconstruction.inverse_problem import (
+    BackOperator,
     InverseProblem,
     lens_type_geometries,
     num_detrend_modes,
     prepare_data,
     prepare_model,
 )
-from gs_jax.solvers.base import UnmatchedAdjointOperator
+from gs_jax.solvers.base import run_solver
 from gs_jax.solvers.richardson_lucy import hat_functions
-from gs_jax.solvers.stepping import run_solver
 from gs_jax.solvers.unrolled import Unrolled
 
 # Steps from plane to plane, and from one plane to the next on which voxels are imaged, mm.
@@ -72,17 +73,34 @@ class Slabs(lx.AbstractLinearOperator):
     transpose, as_matrix = transpose, as_matrix
 
     def mv(self, vector):
-        return self.fine.operator.mv(jnp.tensordot(jnp.asarray(self.shares), vector, 1))
+        return self.fine.mv(jnp.tensordot(jnp.asarray(self.shares), vector, 1))
 
     def in_structure(self):
-        full = self.fine.operator.in_structure()
+        full = self.fine.in_structure()
         return jax.ShapeDtypeStruct((self.shares.shape[1], *full.shape[1:]), full.dtype)
 
     def out_structure(self):
-        return self.fine.operator.out_structure()
+        return self.fine.out_structure()
 
 
 no_structure(Slabs)
+
+
+class Spread(eqx.Module):
+    """Slabs with the back-projection of their planes."""
+
+    slabs: Slabs
+    T: BackOperator
+    least_squares: Slabs
+
+    def mv(self, vector):
+        return self.slabs.mv(vector)
+
+    def in_structure(self):
+        return self.slabs.in_structure()
+
+    def out_structure(self):
+        return self.slabs.out_structure()
 
 
 class Methods:
@@ -102,10 +120,9 @@ class Methods:
                 self.operators[step, fine] = problem(views, modes)
                 continue
             # Back-projection is that of the planes themselves.
-            plain = InverseProblem(binned, grids[step], models[step].optics, views).operator
-            assert isinstance(plain, UnmatchedAdjointOperator)
+            plain = InverseProblem(binned, grids[step], models[step].optics, views)
             slabs, detrended = (Slabs(problem(None, some), spread(step, fine)) for some in (0, modes))
-            self.operators[step, fine] = UnmatchedAdjointOperator(slabs, plain.back, detrended)
+            self.operators[step, fine] = Spread(slabs, plain.T, detrended)
 
     def run(self, image: np.ndarray, step: float, fine: float) -> np.ndarray:
         light, _ = prepare_data(image, self.model)

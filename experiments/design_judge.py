@@ -54,8 +54,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import Reconstructor
+from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
 from gs_jax.simulation.phantoms import letters
 
 # Those that come with the package, for 18 to 23 mm; the first defines the exposures.
@@ -219,8 +218,8 @@ class Methods:
             lucy = METHODS["richardson-lucy"](1)
             assert isinstance(lucy, RichardsonLucy)
             self.lucy: RichardsonLucy = lucy
-            self.start = jax.jit(lambda problem, light: lucy.init(problem.operator, light))
-            self.step = jax.jit(lambda problem, light, state: lucy.step(problem.operator, light, state)[0])
+            self.start = jax.jit(lambda problem, light: lucy.init(problem, light))
+            self.step = jax.jit(lambda problem, light, state: lucy.step(problem, light, state)[0])
         if "unrolled" in settings.methods:
             self.fine = finer(self.grid, settings.width)
             self.unrolled = Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=Progress())

@@ -89,8 +89,7 @@ def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
 
     import gs_jax as gs
     from gs_jax.reconstruction.inverse_problem import prepare_model
-    from gs_jax.reconstruction.methods import METHODS as BY_NAME
-    from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
+    from gs_jax.reconstruction.pipeline import METHODS as BY_NAME, PIXELS_PER_VOXEL, Reconstructor, voxel_grid
 
     scope = gs.geomscope().imager()
     scope = eqx.tree_at(lambda i: i.sensor, scope, gs.Sensor((pixels, pixels), scope.sensor.pixel_pitch))

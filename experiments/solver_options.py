@@ -22,7 +22,7 @@ from experiments.fig9_benchmark import SCENES, Scene
 from gs_jax import PinholeRichardsonLucy, RichardsonLucy, Unrolled, quality, reconstruct
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.reconstruction.methods import METHODS, Method
+from gs_jax.reconstruction.pipeline import METHODS, Method
 
 STEPS = 20
 # Glow: standard deviation relative to the sensor's width, and peak relative to the capture's mean above its offset.

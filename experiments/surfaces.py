@@ -31,8 +31,7 @@ from gs_jax import Grid, Imager, Sensor, Surface, quality, rasterize, read_desig
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import Reconstructor
+from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
 from gs_jax.reconstruction.surface_fit import fit_sheets
 from gs_jax.simulation.phantoms import snowflake
 

@@ -42,8 +42,7 @@ from gs_jax import (
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.projection.point_sources import full_image_of_points
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 
 # Fine voxels of the strokes, mm; planes of a reconstruction from word to word; steps of iterative methods.
 _FINE, _PLANES, STEPS = 0.012, 2, 20

@@ -34,8 +34,7 @@ from gs_jax import Grid, Imager, ImagingOperator, psf_model, quality, rasterize
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.inverse_problem import prepare_data, prepare_model
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import Reconstructor
+from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
 from gs_jax.solvers.base import Operator
 
 PIXELS, ELECTRONS, RAYS, TILE, LAYER = 640, 10_000, 100, 0.1, STEP / 4

@@ -26,7 +26,7 @@ from gs_jax import Grid, Imager, geomscope, quality, rasterize, reconstruct
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction import inverse_problem
-from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import METHODS
 
 # Widths of voxels, relative to the wanted ones, and how far apart they may be on the sensor, in binned pixels. Those of
 # width 0.75 are 1.8 to 1.9 pixels apart, for which the package bins 2 x 2.

@@ -20,9 +20,8 @@ from experiments.design_judge import READ_NOISE, Settings, device, image_of, sce
 from gs_jax import Imager, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import Reconstructor
-from gs_jax.reconstruction.warm_start import follow_volume
+from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
+from gs_jax.reconstruction.plan import follow_volume
 
 MOVES, ELECTRONS, FRAMES = (0.0, 0.04, 0.12), 3000, 3
 FOLLOWED = ("list-rl", "richardson-lucy")

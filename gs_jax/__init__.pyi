@@ -29,17 +29,19 @@ from .projection.operators import (
     BackprojectionOperator as BackprojectionOperator,
     ImagingOperator as ImagingOperator,
 )
-from .reconstruction.cross_validation import cross_validated as cross_validated
 from .reconstruction.deconvolution import deconvolve as deconvolve
-from .reconstruction.methods import BackProjection as BackProjection, PinholeRichardsonLucy as PinholeRichardsonLucy
-from .reconstruction.pipeline import Reconstructor as Reconstructor, reconstruct as reconstruct
-from .reconstruction.residual import forward_residual as forward_residual
+from .reconstruction.pipeline import (
+    BackProjection as BackProjection,
+    PinholeRichardsonLucy as PinholeRichardsonLucy,
+    Reconstructor as Reconstructor,
+    reconstruct as reconstruct,
+)
+from .reconstruction.residual import cross_validated as cross_validated, forward_residual as forward_residual
 from .reconstruction.surface_fit import fit_surface as fit_surface
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
-from .solvers.admm import ADMM as ADMM
+from .solvers.admm import ADMM as ADMM, ConvolutionADMM as ConvolutionADMM
 from .solvers.base import solve as solve
-from .solvers.convolution import ConvolutionADMM as ConvolutionADMM
 from .solvers.fista import FISTA as FISTA
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
 from .solvers.surface import Surface as Surface

@@ -17,8 +17,8 @@ from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.provenance import read_provenance
 from gs_jax.projection.measured_psf import ConvolutionOperator, middle, scene_size
 from gs_jax.reconstruction.deconvolution import deconvolve
-from gs_jax.solvers.base import RESULTS, differences, solve, total_variation
-from gs_jax.solvers.convolution import ConvolutionADMM
+from gs_jax.solvers.admm import ConvolutionADMM, total_variation
+from gs_jax.solvers.base import RESULTS, solve
 
 # PSF and image, odd and even, larger and smaller than each other, one depth and several.
 SIZES = [((3, 4, 7), (11, 16)), ((2, 12, 15), (9, 10))]
@@ -98,9 +98,8 @@ def relative(convolution, image, **weights):
 @partial(jax.jit, static_argnames="isotropic")
 def objective(convolution, image, x, *, tv, l1, isotropic=False):
     residual = convolution.mv(x) - image
-    u = differences(x, wrap=True)
-    if len(x) > 1:  # the planes do not wrap
-        u = u.at[0].set(jnp.diff(x, axis=0, append=x[-1:]))
+    # Planes do not wrap.
+    u = jnp.stack([jnp.diff(x, axis=0, append=x[-1:]), jnp.roll(x, -1, 1) - x, jnp.roll(x, -1, 2) - x])
     variation = total_variation(u, isotropic=isotropic)
     return jnp.vdot(residual, residual) / 2 + tv * variation + l1 * jnp.sum(x)
 

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 import gs_jax as gs
-from gs_jax.reconstruction.cross_validation import folds_of_lenses, kept_pixels_of_folds
-from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import METHODS
+from gs_jax.reconstruction.residual import folds_of_lenses, kept_pixels_of_folds
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step
 
 GRID = gs.Grid(np.array([19.0, 20.0, 21.0]), (31, 31), 0.08)

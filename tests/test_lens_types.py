@@ -25,7 +25,7 @@ from gs_jax.detection.view_samples import LensType, detection_stats, sample_view
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type, type_weights
 from gs_jax.projection.backprojection import backproject
-from gs_jax.reconstruction.methods import BackProjection, PinholeRichardsonLucy
+from gs_jax.reconstruction.pipeline import BackProjection, PinholeRichardsonLucy
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.synthetic import simulate
 from gs_jax.solvers.richardson_lucy import RichardsonLucy

@@ -31,7 +31,7 @@ from gs_jax.mold.height_files import HEIGHT_SUFFIXES, write_heights
 from gs_jax.optics.psf import PSFS
 from gs_jax.projection.forward_model import FIDELITIES
 from gs_jax.reconstruction.deconvolution import SOLVERS
-from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.simulation.synthetic import OPTICS
 
 from .test_cli import RECONSTRUCT, folder, run

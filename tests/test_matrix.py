@@ -31,10 +31,9 @@ from gs_jax.design.datasheets import datasheet
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.mold.height_files import write_heights
 from gs_jax.optics.raytrace import to_numpy
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.reconstruction.plan import follow_volume
 from gs_jax.reconstruction.radius_fit import fit_radius
-from gs_jax.reconstruction.warm_start import follow_volume
 
 from .test_calibration_pattern import discs
 

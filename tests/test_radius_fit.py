@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gs_jax as gs
-from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.radius_fit import _bounds, _middle, fit_radius, with_radii
 
 GRID = gs.Grid([19.0, 20.0, 21.0], (41, 41), 0.1)

@@ -20,10 +20,9 @@ from gs_jax.apps.method_benchmark import skip_reason
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import psf_of_depth
-from gs_jax.reconstruction.inverse_problem import prepare_data, prepare_model
-from gs_jax.reconstruction.methods import METHODS, BackProjection, PinholeRichardsonLucy
-from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid
-from gs_jax.reconstruction.residual import discrepancy_target, forward_residual, noise_variance
+from gs_jax.reconstruction.inverse_problem import discrepancy_target, noise_variance, prepare_data, prepare_model
+from gs_jax.reconstruction.pipeline import METHODS, BackProjection, PinholeRichardsonLucy, reconstruct, voxel_grid
+from gs_jax.reconstruction.residual import forward_residual
 from gs_jax.simulation.synthetic import simulate_volume
 from gs_jax.solvers.base import solve
 from gs_jax.solvers.fista import FISTA
@@ -304,6 +303,6 @@ def test_a_reconstructor_is_compiled_and_mapped(method):
 def test_a_step_of_a_reconstructor_is_differentiated():
     make, image = tiny()
     lucy = make(RichardsonLucy())
-    weight = jax.random.normal(jax.random.key(0), lucy.problem.operator.in_structure().shape)
+    weight = jax.random.normal(jax.random.key(0), lucy.problem.in_structure().shape)
     moment = jax.jit(lambda image: jnp.vdot(weight, lucy.finish(lucy.step(lucy.init(image)))))
     check_grads(moment, (jnp.asarray(image),), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)

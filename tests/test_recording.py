@@ -398,7 +398,7 @@ import sys
 import numpy as np, jax
 from gs_jax import Grid, read_design, reconstruct
 from gs_jax.projection.backprojection import backproject_on_all_devices
-from gs_jax.reconstruction.methods import BackProjection
+from gs_jax.reconstruction.pipeline import BackProjection
 
 imager = read_design("design.toml").imager()
 image = np.random.default_rng(0).uniform(0, 100, imager.sensor.shape).astype(np.float32)

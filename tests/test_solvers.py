@@ -16,10 +16,9 @@ from skimage.restoration import denoise_tv_chambolle, richardson_lucy as of_skim
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.projection.measured_psf import ConvolutionOperator
-from gs_jax.reconstruction.methods import PinholeRichardsonLucy
-from gs_jax.solvers.admm import ADMM
-from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, shrink, solve, total_variation
-from gs_jax.solvers.convolution import ConvolutionADMM
+from gs_jax.reconstruction.pipeline import PinholeRichardsonLucy
+from gs_jax.solvers.admm import ADMM, ConvolutionADMM, shrink, total_variation
+from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, solve
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
 from gs_jax.solvers.surface import Surface
@@ -375,18 +374,16 @@ def test_wrong_arguments_are_named(solver):
         solve(dense(), jnp.zeros(30), RichardsonLucy(background_knots=2))
 
 
-@pytest.mark.parametrize("wrap", [False, True])
-def test_differences_and_their_adjoint(wrap):
+def test_differences_and_their_adjoint():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(3, 1, 5))
-    d = np.asarray(jax.jit(partial(differences, wrap=wrap))(x))
-    end = x[:1] if wrap else x[-1:]
-    np.testing.assert_array_equal(d[0], np.diff(x, axis=0, append=end))
+    d = np.asarray(jax.jit(differences)(x))
+    np.testing.assert_array_equal(d[0], np.diff(x, axis=0, append=x[-1:]))
     assert d.shape == (2, 3, 1, 5)  # nothing along an axis of 1
     u = rng.normal(size=d.shape)
-    adjoint = jax.jit(partial(differences_adjoint, wrap=wrap))(u)
+    adjoint = jax.jit(differences_adjoint)(u)
     np.testing.assert_allclose(np.vdot(d, u), np.vdot(x, adjoint), rtol=1e-12)
-    assert jax.eval_shape(partial(differences, wrap=wrap), jnp.ones((1, 1, 1))).shape == (0, 1, 1, 1)
+    assert jax.eval_shape(differences, jnp.ones((1, 1, 1))).shape == (0, 1, 1, 1)
 
 
 @pytest.mark.parametrize("isotropic", [False, True])
@@ -420,7 +417,7 @@ def test_few_applications_of_the_operator_reach_the_minimum(tv):
     def final(solver):
         x = solve(A, image, solver).value
         residual = A.mv(x) - image
-        variation = total_variation(differences(x, wrap=False), isotropic=False)
+        variation = total_variation(differences(x), isotropic=False)
         return float(jnp.vdot(residual, residual) / 2 + unit * (tv * variation + 0.01 * jnp.sum(x)))
 
     found, least = (final(ADMM(steps, sparsity=0.01, tv=tv)) for steps in (20, 2000))

@@ -14,7 +14,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.surfaces import read_surface, write_surface
 from gs_jax.reconstruction.surface_fit import follow_sheets
-from gs_jax.solvers.sheets import first_sheets, interpolated
+from gs_jax.solvers.surface import first_sheets, interpolated
 from gs_jax.widget.layers import reader
 
 GRID = {"shape": (45, 45), "pitch": 0.08}

@@ -47,12 +47,12 @@ def voxels_and_image() -> tuple[InverseProblem, np.ndarray, np.ndarray]:
     scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
     system = InverseProblem(scope, grid, None, (LensTypeGeometry(scope),))
     truth = np.random.default_rng(0).random(grid.volume_shape)
-    return system, truth, np.asarray(system.operator.mv(jnp.asarray(truth)))
+    return system, truth, np.asarray(system.mv(jnp.asarray(truth)))
 
 
 def small(networks: Unrolled) -> tuple[Unrolled, UnrolledExample]:
     system, truth, light = voxels_and_image()
-    start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
+    start = networks.step(system, light, networks.init(system, light))[0]
     return networks, UnrolledExample(light, system, truth, start)
 
 
@@ -90,7 +90,7 @@ def differentiable():
 def test_darkness_stays_dark_and_has_finite_gradients(differentiable):
     networks, case, loss = differentiable
     dark = (np.zeros_like(case.light), np.zeros_like(case.truth))
-    assert not solve(case.system.operator, dark[0], networks).value.any()
+    assert not solve(case.system, dark[0], networks).value.any()
     _, back = jax.vjp(lambda networks: loss(networks, *dark), networks)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(back(jnp.ones(()))))
 
@@ -105,7 +105,7 @@ def test_gradients_by_the_weights(differentiable):
 @pytest.mark.integration
 def test_gradients_by_the_image(differentiable):
     networks, case, _ = differentiable
-    volume = jax.jit(lambda light: solve(case.system.operator, light, networks).value)
+    volume = jax.jit(lambda light: solve(case.system, light, networks).value)
     check_grads(volume, (jnp.asarray(case.light),), 1, modes=["rev"], rtol=2e-3)
 
 
@@ -114,11 +114,11 @@ def test_the_last_steps_are_conjugate_gradients():
     """SciPy's, with the same preconditioner and as many, where slow waves are left out of account."""
     networks, case = small(initialize_unrolled(1, 1, 4, 4, key=KEY))
     scope, grid = case.system.imager, case.system.grid
-    A = InverseProblem(scope, grid, None, case.system.back_projections, detrend_modes=2).operator
+    A = InverseProblem(scope, grid, None, case.system.back_projections, detrend_modes=2)
     state = networks.init(A, case.light)
     for _ in range(networks.steps):
         state = networks.step(A, case.light, state)[0]
-    exact, shape, size = InverseProblem(scope, grid, None, detrend_modes=2).operator, case.truth.shape, case.truth.size
+    exact, shape, size = InverseProblem(scope, grid, None, detrend_modes=2), case.truth.shape, case.truth.size
     back = lambda image: np.asarray(exact.T.mv(jnp.asarray(image))).ravel()
     x = np.asarray(state.lucy.x)
     variance = blurred(x).ravel() * (x**2).sum() / x.sum()

@@ -8,8 +8,8 @@ import pytest
 import gs_jax as gs
 from experiments.warm_start import Counted
 from gs_jax.base.progress import Progress
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.warm_start import follow_volume
+from gs_jax.reconstruction.pipeline import METHODS
+from gs_jax.reconstruction.plan import follow_volume
 
 from .test_cli import folder, run
 from .test_recording import command, save, volumes

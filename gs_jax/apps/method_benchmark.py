@@ -46,8 +46,7 @@ from ..optics.psf import geometric_psf
 from ..optics.theory import FWHM
 from ..projection.operators import ImagingOperator
 from ..reconstruction.inverse_problem import subtract_offset
-from ..reconstruction.methods import BackProjection, PinholeRichardsonLucy
-from ..reconstruction.pipeline import reconstruct
+from ..reconstruction.pipeline import BackProjection, PinholeRichardsonLucy, reconstruct
 from ..simulation.synthetic import Camera, electrons, expose, simulate_points
 from ..solvers.admm import ADMM
 from ..solvers.base import lambda_max, solve

@@ -6,24 +6,21 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float32, Num
+from jaxtyping import Array, Float, Float32, Num
 
 from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..projection.measured_psf import ConvolutionOperator, FieldConvolutionOperator
-from ..solvers.admm import ADMM
-from ..solvers.convolution import ConvolutionADMM
+from ..projection.measured_psf import ConvolutionOperator, FieldConvolutionOperator, middle, scene_size
+from ..solvers.admm import ADMM, ConvolutionADMM
+from ..solvers.base import estimate_of, run_solver
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
-from ..solvers.stepping import estimate_of, run_solver
 from ..typing import Image
-from .inverse_problem import subtract_offset, sum_pixels
+from .inverse_problem import discrepancy_target, subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR
-from .residual import discrepancy_target
 from .smoothness import Smoothness, choose_smoothness, image_of
-from .wiener import filter_by_wiener
 
 # Relative change of the last step below which a solver has converged.
 CONVERGED = 1e-3
@@ -33,6 +30,11 @@ _CUT, _EDGE = 0.1, 2
 # of 960 x 960 voxels were 13.7 arrays with ConvolutionADMM, 8.2 with FISTA and 8.6 with Richardson-Lucy; with one
 # component and three, 22.0 and 22.3 with ADMM, 6.9 and 9.4 with FISTA, 7.2 and 13.8 with Richardson-Lucy.
 _ARRAYS, _EACH_COMPONENT = {ConvolutionADMM: 16, ADMM: 18, FISTA: 9, RichardsonLucy: 9}, 4
+
+# Share of an edge within which images fade out.
+_TAPER = 0.05
+# Ratios of noise to signal that are tried, relative to the largest power of the PSF.
+_RATIOS = np.geomspace(1e-7, 1e-1, 25)
 
 Deconvolver = ConvolutionADMM | ADMM | FISTA | RichardsonLucy
 # Solvers by the names of the command line, as functions of the number of steps.
@@ -196,6 +198,42 @@ def filter_image(image: Image, psf: Num[Array | np.ndarray, "*depth high wide"])
     return unit * filter_by_wiener(light, spots[0])[0]
 
 
+def filter_by_wiener(
+    light: Float32[np.ndarray, "row column"], psf: Float[np.ndarray, "high wide"]
+) -> tuple[Float32[np.ndarray, "row column"], float]:
+    """Deconvolve a capture by one PSF with a Wiener filter; return the scene, and the ratio of noise to signal.
+
+    The ratio, which is the same at all frequencies, is chosen by generalised cross-validation (Golub, Heath and Wahba,
+    Technometrics 21, 215, 1979). Negative values are set to 0. Light from beyond the sensor's edges is not modelled.
+    """
+    from scipy import fft
+
+    size = scene_size(light.shape, psf.shape)
+    light, psf = (_tapered(a) for a in (light, psf))
+    image, spot = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    image[middle(light.shape, size)] = light
+    spot[: psf.shape[0], : psf.shape[1]] = psf
+    spot = np.roll(spot, [-(k // 2) for k in psf.shape], (0, 1))
+    seen, transfer = (np.asarray(fft.rfft2(a, workers=-1)) for a in (image, spot))
+    power = np.abs(transfer) ** 2
+    energy, peak = np.abs(seen) ** 2, power.max()
+
+    def score(ratio):
+        """Sum of squared residuals over the squared number of degrees of freedom that are left."""
+        left = ratio / (power / peak + ratio)
+        return float(np.mean(left**2 * energy) / np.mean(left) ** 2)
+
+    ratio = min(_RATIOS, key=score)
+    scene = np.asarray(fft.irfft2(seen * transfer.conj() / (power + ratio * peak), size, workers=-1))
+    return np.maximum(scene[middle(light.shape, size)], 0).astype(np.float32), float(ratio)
+
+
+def _tapered(image):
+    """An image that fades out at its edges: a cut would be taken for detail, and leave bright lines."""
+    rows, columns = (np.minimum(1, (np.arange(n) + 0.5) / (_TAPER * n)).astype(np.float32) for n in image.shape)
+    return image * np.minimum(rows, rows[::-1])[:, None] * np.minimum(columns, columns[::-1])
+
+
 def _light(image):
     """An image above its offset, of the order of 1, which suits the weights of priors; and its unit."""
     check_finite("image", image)
@@ -271,7 +309,7 @@ def _of_any_operator(solver: Deconvolver) -> Deconvolver:
     if not isinstance(solver, ConvolutionADMM):
         return solver
     if solver.tv_z != 1 or not solver.nonnegative:
-        given = f"tv_z={solver.tv_z or 0:g}, nonnegative={solver.nonnegative}"
+        given = f"tv_z={solver.tv_z:g}, nonnegative={solver.nonnegative}"
         raise input_error("solver", "with tv_z=1 and nonnegative=True for PSFs that vary over the field", given)
     return ADMM(solver.steps, solver.tolerance, solver.sparsity, solver.tv, solver.isotropic)
 

@@ -1,6 +1,7 @@
-"""Reconstruction of a volume from a capture, by any method."""
+"""Reconstruction of a volume from a capture by any method, and the table of methods."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,15 +19,21 @@ from ..grid import Grid
 from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject, backproject_on_all_devices
 from ..projection.forward_model import FIDELITIES, Optics, check_optics
-from ..solvers.base import check_solver
-from ..solvers.richardson_lucy import RichardsonLucy
-from ..solvers.stepping import estimate_of, run_solver, start_solver, take_step
+from ..solvers.admm import ADMM
+from ..solvers.base import Operator, Solver, check_solver, estimate_of, run_solver, start_solver, take_step
+from ..solvers.fista import FISTA
+from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
-from .inverse_problem import InverseProblem, LensTypeGeometry, lens_type_geometries, prepare_data, prepare_model
-from .methods import BackProjection, Method, PinholeRichardsonLucy, check_stop
-from .residual import discrepancy_target
+from .inverse_problem import (
+    InverseProblem,
+    LensTypeGeometry,
+    discrepancy_target,
+    lens_type_geometries,
+    prepare_data,
+    prepare_model,
+)
 
 # Planes that each device back-projects between two updates of the progress bar.
 _PLANES = 16
@@ -34,6 +41,87 @@ _PLANES = 16
 PIXELS_PER_VOXEL = 4
 # The noise's share of the cost is known to a few percent.
 DISCREPANCY_FACTOR = 1.1
+
+
+class BackProjection(eqx.Module):
+    """Back-projection, the paper's reconstruction: one pass, no PSF.
+
+    *Host.*
+
+    Parameters
+    ----------
+    interpolation
+        Between pixels, `"linear"` or `"nearest"` (the paper's).
+    normalize
+        Divide by the summed weights, so that a uniform image gives a uniform volume.
+
+    Raises
+    ------
+    InputError
+        If `interpolation` is neither.
+
+    Examples
+    --------
+    >>> volume = gs.reconstruct(np.ones((200, 200)), scope, grid, gs.BackProjection(normalize=True))
+    >>> print(round(float(volume[1, 20, 20]), 3))
+    1.0
+    """
+
+    interpolation: str = eqx.field(static=True, default="linear")
+    normalize: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if self.interpolation not in ("linear", "nearest"):
+            raise InputError(f"interpolation must be 'linear' or 'nearest', got {self.interpolation!r}.")
+
+
+class PinholeRichardsonLucy(RichardsonLucy):
+    """Richardson-Lucy with the pinhole back-projection in place of the adjoint.
+
+    *Host.*
+
+    Each voxel is multiplied by the mean ratio of the measured to the expected image over the pixels that
+    back-projection reads: `backproject(ratio, ..., normalize=True)`. The expected image is the forward model's. Without
+    a PSF this is `RichardsonLucy` with the ray operator; with one, the back-projection is sharper than the adjoint, and
+    fewer steps suffice. Parameters and errors are those of `RichardsonLucy`.
+
+    Examples
+    --------
+    >>> volume = gs.reconstruct(image, scope, grid, gs.PinholeRichardsonLucy(steps=3), optics="near")
+    >>> print(volume.argmax() == np.ravel_multi_index((1, 19, 22), volume.shape))
+    True
+    """
+
+    def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> LucyState:
+        if not getattr(A, "back_projections", None):
+            raise InputError(f"PinholeRichardsonLucy() must be used with reconstruct, got a {type(A).__name__}.")
+        return super().init(A, image)
+
+
+# Near the edge of the field one lens sees a voxel, in its middle a dozen.
+_LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitivity": 0.3}
+
+Method = BackProjection | Solver
+
+# Methods by the names of the command line and the benchmark, as functions of the number of steps. Those that are not in
+# `STEPPED` take none: the unrolled solver has as many as were trained, and sheets as many as they need.
+STEPPED = ("list-rl", "richardson-lucy", "fista", "admm")
+METHODS: dict[str, Callable[[int], Method]] = {
+    "backproject": lambda steps: BackProjection(),
+    "list-rl": lambda steps: PinholeRichardsonLucy(steps, **_LUCY),
+    "richardson-lucy": lambda steps: RichardsonLucy(steps, **_LUCY),
+    "fista": FISTA,
+    "admm": ADMM,
+    "unrolled": lambda steps: Unrolled.pretrained(),
+    "surface": lambda steps: Surface(),
+}
+
+
+def check_stop(method: Method, stop_at_discrepancy: bool) -> None:
+    """Raise `InputError` if a method cannot stop at the noise: it has no steps, or steps that belong together."""
+    if stop_at_discrepancy and isinstance(method, BackProjection | Unrolled | Surface):
+        allowed = "RichardsonLucy(), PinholeRichardsonLucy(), FISTA() or ADMM()"
+        raise InputError(f"stop_at_discrepancy must be used with {allowed}, got {type(method).__name__}().")
 
 
 def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1) -> Grid:

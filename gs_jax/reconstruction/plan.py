@@ -4,6 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..base.errors import InputError
@@ -11,18 +13,20 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..optics.lens_types import blur_warning, sharpness
+from ..solvers.richardson_lucy import State as LucyState, restarted
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled, read_unrolled
 from ..typing import Image, Volume
-from .cross_validation import CrossValidation, cross_validated
-from .methods import METHODS, STEPPED, Method
-from .pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
-from .residual import ForwardResidual, forward_residual
+from .pipeline import METHODS, PIXELS_PER_VOXEL, STEPPED, Method, Reconstructor, voxel_grid
+from .residual import CrossValidation, ForwardResidual, cross_validated, forward_residual
 from .surface_fit import SurfaceFit, follow_sheets
-from .warm_start import follow_volume
 
 # Steps of an iterative method.
 _STEPS = 20
+# What an image may leave unexplained, of what the last one that took all steps left, for its steps to end.
+_ENOUGH = 1.02
+# Relative change of the light with which an image starts afresh: it, or the one before, may be dark.
+_CHANGED = 0.5
 
 
 class Result(NamedTuple):
@@ -185,3 +189,39 @@ def _method(name: str, steps: int, weights: Path | None, options: dict[str, floa
             names = [other for other, make in METHODS.items() if hasattr(make(1), option)]
             raise InputError(f"--{option} must be used with {', '.join(names)}, got --method {name}.")
     return dataclasses.replace(method, **given)
+
+
+class LastVolume(NamedTuple):
+    """State of the last image, its light, and what the last one that took all steps left of its light."""
+
+    solver: LucyState
+    light: float
+    unexplained: float
+
+
+def follow_volume(
+    reconstructor: Reconstructor, image: Image, last: LastVolume | None, progress: Progress
+) -> tuple[Volume, LastVolume]:
+    """Reconstruct an image by Richardson-Lucy from the volume of the last one; return what the next one starts from.
+
+    The first image takes all steps. Each of the others starts from the volume of the last one, and its steps end when
+    they explain it as well as all steps explained an earlier one. An image with much more or less light than the last
+    one starts afresh.
+    """
+    light = float(np.sum(image, dtype=float))
+    # No step lights a volume that is dark.
+    follows = last is not None and abs(light - last.light) < _CHANGED * last.light and bool(last.solver.x.any())
+    target = _ENOUGH * last.unexplained * light if last and follows else 0.0
+    state = reconstructor.init(image, _restart(last.solver) if last and follows else None)
+    state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
+    # The divergence of counts is proportional to their sum.
+    unexplained = last.unexplained if last else 0.0
+    if state.cost >= target:
+        unexplained = state.cost / light if light > 0 else 0.0
+    return np.asarray(reconstructor.finish(state), np.float32), LastVolume(state.solver, light, unexplained)
+
+
+@jax.jit
+def _restart(state):
+    # A copy, as steps overwrite their state.
+    return jax.tree.map(jnp.copy, restarted(state))

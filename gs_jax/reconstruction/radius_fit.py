@@ -20,10 +20,9 @@ from ..geometry import Imager, field_limit
 from ..grid import Grid
 from ..io.camera import Readout
 from ..typing import Image
-from .cross_validation import check_scored, kept_pixels_of_folds, light_of, relative, residual_of
 from .inverse_problem import prepare_model, sum_pixels
-from .methods import Method
-from .pipeline import Reconstructor
+from .pipeline import Method, Reconstructor
+from .residual import check_scored, kept_pixels_of_folds, light_of, relative, residual_of
 
 # Groups of lenses, one of which is predicted.
 _FOLDS = 4

@@ -1,25 +1,25 @@
-"""Residual between a capture and the image of its reconstruction: forward residual, and level that noise explains."""
+"""How well a volume explains a capture: the forward residual, and cross-validation by lenses that were not used."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Shaped
+from jaxtyping import Array, Float, Int
 
 from ..base.arrays import check_finite, host_code
+from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import Optics, forward
-from ..typing import Image
-from .inverse_problem import prepare_data, prepare_model
+from ..solvers.surface import Surface
+from ..typing import Image, Volume
+from .inverse_problem import InverseProblem, binned_variance, prepare_data, prepare_model
+from .pipeline import BackProjection, Method, Reconstructor, check_call, check_stop
 
 # Regions along a side of the sensor, unless it has fewer pixels.
 _REGIONS = 16
-# Side of the squares in which noise is estimated, pixels.
-_SQUARE = 32
-# Median absolute value of a standard normal variable.
-_NORMAL_MEDIAN = 0.6745
 
 
 class ForwardResidual(NamedTuple):
@@ -102,50 +102,163 @@ def rms_of_regions(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, 
     return np.sqrt(sums(image**2) / sums(np.ones_like(image)))
 
 
-def noise_variance(image: Shaped[np.ndarray, "row column"]) -> Float64[np.ndarray, "square_row square_column"]:
-    """Variance of a capture's noise in each square of 32 pixels (the last may be smaller); 0 below 3 pixels a side.
-
-    From second differences along rows and columns, in which smooth light cancels (Immerkaer, Comput. Vis. Image
-    Underst. 64, 300, 1996), and their median, which sharp spots hardly change.
-    """
-    image = np.asarray(image, np.float64)
-    if min(image.shape) < 3:
-        return np.zeros((1, 1))
-    # Each second difference multiplies the variance of independent noise by 6.
-    difference = np.abs(np.diff(np.diff(image, 2, axis=0), 2, axis=1)) / 6
-    starts = [range(0, n, _SQUARE) for n in difference.shape]
-    median = [[np.median(difference[r : r + _SQUARE, c : c + _SQUARE]) for c in starts[1]] for r in starts[0]]
-    return (np.array(median) / _NORMAL_MEDIAN) ** 2
-
-
-def binned_variance(
-    image: Shaped[np.ndarray, "row column"], shape: tuple[int, ...]
-) -> Float64[np.ndarray, "binned_row binned_column"]:
-    """Variance of the noise in each pixel of the capture that is binned to this shape."""
-    side, variance = image.shape[0] // shape[0], noise_variance(image)
-    squares = (np.arange(n) * side // _SQUARE for n in shape)
-    return side**2 * variance[np.ix_(*(np.minimum(s, n - 1) for s, n in zip(squares, variance.shape, strict=True)))]
-
-
-def discrepancy_target(
-    image: Shaped[np.ndarray, "row column"], light: Float[np.ndarray, "binned_row binned_column"], *, counts: bool
-) -> float:
-    """Cost that noise alone leaves a solver, by the discrepancy principle (Morozov, 1966).
+class CrossValidation(NamedTuple):
+    """How well a method predicts pixels that it did not use; no ground truth is needed.
 
     Parameters
     ----------
-    image
-        The capture.
-    light
-        Data to explain: the capture in binned pixels, above the offset.
-    counts
-        Whether the cost is the Kullback-Leibler divergence, `sum(variance / (2 mean))`, or half the squares.
+    error
+        RMS of the difference between prediction and capture, relative to that of the capture above its background: 0 if
+        all is predicted, 1 for an empty volume.
+    noise
+        The same of the capture's noise alone, as far as its pixels tell: no prediction has less.
+    folds
+        The error of each fold, relative to the RMS of its own pixels.
+    regions
+        The error in squares of the sensor, relative to the whole capture's RMS.
     """
-    from scipy.ndimage import uniform_filter  # imported here: back-projection does without SciPy
 
-    side, variance = image.shape[0] // light.shape[0], binned_variance(image, light.shape)
-    if counts:
-        # In the dark, where negative pixels count as 0, the divergence is of the order of the noise.
-        mean = np.maximum(uniform_filter(np.asarray(light, np.float64), max(_SQUARE // side, 1)), np.sqrt(variance))
-        variance = np.divide(variance, mean, out=np.zeros_like(variance), where=mean > 0)
-    return float(variance.sum() / 2)
+    error: float
+    noise: float
+    folds: Float[np.ndarray, " fold"]
+    regions: Float[np.ndarray, "row column"]
+
+    @property
+    def score_db(self) -> float:
+        """How much smaller the error is than that of an empty volume, `20 log10(1 / error)`, dB."""
+        return 20 * math.log10(1 / max(self.error, 1e-12))
+
+    @property
+    def best_db(self) -> float:
+        """The score of a perfect volume: noise cannot be predicted."""
+        return 20 * math.log10(1 / max(self.noise, 1e-12))
+
+
+@host_code()
+def cross_validated(
+    image: Image,
+    imager: Imager,
+    grid: Grid,
+    method: Method = BackProjection(),
+    *,
+    optics: Optics | str = "full",
+    stop_at_discrepancy: bool = False,
+    folds: int = 4,
+    progress: Progress | None = None,
+) -> CrossValidation:
+    """Score a method on a capture: reconstruct without some lenses, predict their light, and compare.
+
+    *Host.*
+
+    Takes as long as `folds` reconstructions.
+
+    Sub-images overlap, so that light cannot be divided by lenses. Pixels can: each belongs to the nearest lens, whose
+    light is most of its light, and each lens to one of the folds, those of neighbours differing. A fold is
+    reconstructed from the pixels of all others; its own count nowhere, not as dark. A voxel is seen through a dozen
+    lenses, so the others know it. The image of that volume predicts the pixels of the fold, with a gain that fits it
+    best to the pixels that were used. A pixel was so either used or predicted, and its noise is independent of the
+    prediction: a method that fits noise, or what the model lacks, to some lenses is wrong about the others.
+    `forward_residual` sees pixels that were fitted, and improves with every step.
+
+    Images are compared as iterative methods see them: above the camera's offset, with pixels as wide as voxels, without
+    background that is smooth or that the optics lack. That background is the whole capture's, a few numbers that are
+    the same for all methods. Squares count equally, so bright pixels count most, as they do in the PSNR of volumes.
+
+    Compare methods, options and calibrations on one capture by `score_db`; scores of different scenes differ. It does
+    not see a volume's unit, nor where lenses see nothing.
+
+    Parameters
+    ----------
+    image, imager, grid, method, optics, stop_at_discrepancy, progress
+        As for `reconstruct`; not `Surface`.
+    folds
+        2 or more, at most as many as lenses.
+
+    Raises
+    ------
+    InputError
+        As for `reconstruct`; if there are not so many folds, or the method is `Surface`.
+
+    Examples
+    --------
+    >>> found = gs.cross_validated(image, scope, grid, gs.RichardsonLucy(steps=5), optics="near", folds=3)
+    >>> print(found.error < 1, found.folds.shape)
+    True (3,)
+    """
+    check_stop(method, stop_at_discrepancy)
+    check_scored(image, imager, grid, method, optics)
+    progress = progress or Progress()
+    options = {"stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
+    problem = prepare_model(imager, grid, optics, progress)
+    reconstructor = Reconstructor(imager, grid, method, optics, **options)
+    light = light_of(image, problem)
+    residual, parts = np.zeros_like(light), []
+    for kept in progress.track(kept_pixels_of_folds(problem.imager, folds), "Cross-validating"):
+        rest = residual_of(reconstructor.keeping(kept)(image, progress), light, problem, kept)
+        left_out = kept == 0
+        residual[left_out] = rest[left_out]
+        parts.append(relative(rest[left_out], light[left_out]))
+    noise = math.sqrt(binned_variance(np.asarray(image), light.shape).mean())
+    rms = float(np.sqrt(np.mean(light**2)))
+    # Any volume predicts a dark capture.
+    regions = rms_of_regions(residual) / (rms if rms > 0 else 1)
+    return CrossValidation(
+        relative(residual, light), min(noise / rms, 1.0) if rms > 0 else 0.0, np.array(parts), regions
+    )
+
+
+def check_scored(image, imager, grid, method, optics):
+    """Raise the errors of `cross_validated` that need no computation."""
+    check_call(image, imager, grid, method, optics)
+    if isinstance(method, Surface):
+        raise InputError("method must be one of free voxels to be scored by other lenses, got Surface().")
+
+
+def light_of(image: Image, problem: InverseProblem) -> Float[np.ndarray, "y x"]:
+    """The light of a capture without background."""
+    light, background = prepare_data(image, problem)
+    return np.asarray(problem.detrend(light - background), np.float64)
+
+
+def residual_of(volume: Volume, light: np.ndarray, problem: InverseProblem, kept: np.ndarray) -> np.ndarray:
+    """What a volume leaves of the light, with a gain that fits the pixels that are kept (1, and 0 for others)."""
+    imager = problem.imager
+    image = forward(jnp.asarray(volume, imager.sensor_distance.dtype), imager, problem.grid, problem.optics)
+    shown = np.asarray(problem.detrend(image), np.float64)
+    energy = np.vdot(kept * shown, shown)
+    return light - (max(np.vdot(kept * shown, light) / energy, 0) if energy > 0 else 0) * shown
+
+
+def kept_pixels_of_folds(imager: Imager, count: int) -> list[Float[np.ndarray, "row column"]]:
+    """For each fold, 1 for pixels of other folds, and 0 for its own.
+
+    Raises
+    ------
+    InputError
+        Unless there are 2 or more folds, and at least as many lenses.
+    """
+    from scipy.spatial import KDTree  # imported here: back-projection does without SciPy
+
+    centers = np.asarray(imager.centers)
+    if len(centers) < 2:
+        raise InputError("a capture must be seen by 2 or more lenses to be predicted by others, got 1 lens.")
+    if not (isinstance(count, int) and 2 <= count <= len(centers)):
+        raise InputError(f"folds must be 2 to {len(centers)}, the number of lenses, got {short_repr(count)}.")
+    pixels = np.moveaxis(np.indices(imager.sensor.shape), 0, -1)
+    own = folds_of_lenses(centers, count)[KDTree(np.asarray(imager.sensor.to_pixels(centers))).query(pixels)[1]]
+    return [np.asarray(own != fold, imager.sensor_distance.dtype) for fold in range(count)]
+
+
+def folds_of_lenses(centers: Float[np.ndarray, "lens 2"], count: int) -> Int[np.ndarray, " lens"]:
+    """Fold of each lens: from the middle outwards, the one whose nearest lens is farthest."""
+    folds = np.full(len(centers), -1)
+    for lens in np.argsort(np.hypot(*(centers - centers.mean(0)).T), kind="stable"):
+        apart = np.hypot(*(centers - centers[lens]).T)
+        folds[lens] = np.argmax([apart[folds == fold].min(initial=np.inf) for fold in range(count)])
+    return folds
+
+
+def relative(residual: Float[np.ndarray, "..."], light: Float[np.ndarray, "..."]) -> float:
+    """RMS of a residual, relative to that of the light; 0 without light."""
+    energy = float(np.sum(light**2))
+    return float(np.sqrt(np.sum(residual**2) / energy)) if energy > 0 else 0.0

@@ -12,11 +12,9 @@ from jaxtyping import Float32
 
 from ..base.progress import Progress
 from ..projection.measured_psf import ConvolutionOperator, FieldConvolutionOperator
-from ..solvers.admm import ADMM
-from ..solvers.convolution import ConvolutionADMM
-from ..solvers.stepping import run_solver
-from .inverse_problem import sum_pixels
-from .residual import binned_variance
+from ..solvers.admm import ADMM, ConvolutionADMM
+from ..solvers.base import run_solver
+from .inverse_problem import binned_variance, sum_pixels
 
 # Weights that are tried: from the first on, weaker and weaker ones, and then stronger and stronger ones, each from the
 # solution of the one before. From nothing, a scene builds up too slowly with a strong weight, and a weak one fits noise

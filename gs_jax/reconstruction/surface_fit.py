@@ -12,7 +12,7 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import Optics
-from ..solvers.stepping import estimate_of
+from ..solvers.base import estimate_of
 from ..solvers.surface import RESTARTED_STEPS, State, Surface, depth_of_sheets, restarted
 from ..typing import Image, Volume
 from .pipeline import Reconstructor, check_call

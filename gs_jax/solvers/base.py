@@ -1,70 +1,59 @@
-"""Solver interface and result, the loop that runs a solver, and the differences of total variation.
+"""Interfaces of operators and solvers, the loops that run a solver, and what solvers share.
 
 A solver is an `eqx.Module` that holds its options and has three methods: `init`, `step` and `estimate`. Its state keeps
 what does not change from step to step, so that it is computed once. `solve` runs all steps in one compiled loop;
-callers that show or interrupt the iteration call `step` themselves.
+`run_solver` runs them one by one, with progress and a way out after each.
 """
 
 import dataclasses
-from typing import Any, Protocol, runtime_checkable
+import math
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num, PyTree
 
-from ..base.arrays import check_real, divide, native, safe_sqrt
+from ..base.arrays import check_real, native, safe_sqrt
 from ..base.errors import InputError, short_repr
+from ..base.progress import Progress
 
 # Weights with a standard deviation of one voxel.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
 
-class UnmatchedAdjointOperator(eqx.Module):
-    """Operator with a back-projection that is not its adjoint: `A.mv` is `forward.mv`, `A.T.mv` is `back.mv`.
+@runtime_checkable
+class Operator(Protocol):
+    """Interface of a linear operator: those of `lineax` have it.
 
-    Richardson-Lucy converges in fewer steps with a back-projection that is sharper than the adjoint (Zeng and Gullberg,
-    IEEE Trans. Med. Imaging 19, 548, 2000).
-
-    Parameters
-    ----------
-    forward, back
-        From volumes to images, and from images to volumes.
-    least_squares
-        Operator for least squares, which use its exact adjoint; by default `forward`.
-    kept
-        1 for pixels that count, and 0 for those that are left out; `forward` is zero there, and `back` does not read
-        them. None keeps all.
+    An operator may have two more attributes. `kept` is 1 for pixels that count and 0 for others, where its images are
+    0; None keeps all. `least_squares` is the operator for least squares, whose `T` is the exact adjoint, where `T` of
+    the operator itself is a back-projection that is not.
     """
 
-    forward: lx.AbstractLinearOperator
-    back: lx.AbstractLinearOperator
-    least_squares: lx.AbstractLinearOperator | None = None
-    kept: Float[Array, "..."] | None = None
-
     @property
-    def T(self) -> "UnmatchedAdjointOperator":
-        return UnmatchedAdjointOperator(self.back, self.forward)
+    def T(self) -> Any:
+        """The adjoint, or the back-projection that replaces it."""
+        ...
 
-    def mv(self, vector):
-        return self.forward.mv(vector)
+    def mv(self, vector: Any, /) -> Array:
+        """The image of a volume."""
+        ...
 
-    def in_structure(self):
-        return self.forward.in_structure()
+    def in_structure(self) -> Any:
+        """Shape and type of volumes."""
+        ...
 
-    def out_structure(self):
-        return self.forward.out_structure()
-
-
-Operator = lx.AbstractLinearOperator | UnmatchedAdjointOperator
+    def out_structure(self) -> Any:
+        """Shape and type of images."""
+        ...
 
 
 def kept_pixels(A: Operator) -> Float[Array, "..."] | None:
-    """The pixels that an operator does not leave out; None if it keeps all."""
+    """1 for pixels that an operator keeps and 0 for others; None if it keeps all."""
     return getattr(A, "kept", None)
 
 
@@ -234,6 +223,79 @@ def _solve(A, image, solver, state, steps, tolerance) -> Solution:
     return Solution(value, result, {"num_steps": number, "costs": costs}, state)
 
 
+class Run(NamedTuple):
+    """Last state of a solver, cost and residual of its last step, and the number of steps."""
+
+    state: Any
+    cost: float = math.nan
+    residual: float = math.nan
+    steps: int = 0
+
+
+def run_solver(
+    solver: Any,
+    light: Any,
+    A: Any,
+    progress: Progress,
+    *,
+    target: float = 0.0,
+    state: Any = None,
+    quarter: str = "",
+) -> Run:
+    """Run a solver step by step until it converges or the cost at the start of a step is below the target.
+
+    Starts from `state`, which it overwrites, if given. `quarter`: as for `Progress.counter`.
+    """
+    run = Run(start_solver(solver, light, A) if state is None else state)
+    with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
+        for number in range(1, solver.steps + 1):
+            state, cost, residual = _step_in_place(run.state, _for_one_step(solver), light, A)
+            # Reading the numbers waits for the step: progress is true, and Ctrl-C ends it here.
+            run = Run(state, float(cost), float(residual), number)
+            if run.residual < solver.tolerance or run.cost < target:
+                break
+            advance()
+    return run
+
+
+def start_solver(solver: Any, light: Any, A: Any) -> Any:
+    """State before the first step, by one compiled program."""
+    return _init(_for_one_step(solver), light, A)
+
+
+def take_step(state: Any, solver: Any, light: Any, A: Any) -> tuple[Any, Any, Any]:
+    """`solver.step`, by one compiled program."""
+    return _step(state, _for_one_step(solver), light, A)
+
+
+def _for_one_step(solver):
+    # Decided here and not in compiled code: another number of steps compiles nothing.
+    return dataclasses.replace(solver, steps=1, tolerance=0.0)
+
+
+@jax.jit
+def estimate_of(solver: Any, state: Any) -> Any:
+    """`solver.estimate`, by one compiled program."""
+    return solver.estimate(state)
+
+
+@jax.jit
+def _init(solver, light, A):
+    return _strong(solver.init(A, light))
+
+
+def _take_step(state, solver, light, A):
+    return _strong(solver.step(A, light, state))
+
+
+def _strong(state):
+    # A number of a weak type at first, and of a strong one after a step, would compile the step twice.
+    return jax.tree.map(lambda leaf: lax.convert_element_type(leaf, leaf.dtype), state)
+
+
+_step, _step_in_place = jax.jit(_take_step), jax.jit(_take_step, donate_argnums=0)
+
+
 def check_solver(name: str, solver: Any) -> None:
     """Raise an `InputError` unless this is an object with the methods of a solver."""
     # A class has the attributes of the protocol, too.
@@ -289,37 +351,22 @@ def norm(x: PyTree) -> Float[Array, ""]:
     return safe_sqrt(jnp.asarray(square))
 
 
-def differences(x: Float[Array, "*shape"], *, wrap: bool) -> Float[Array, " axis *shape"]:
-    """Forward differences along each axis longer than 1; the last one is 0, or periodic with `wrap`."""
+def differences(x: Float[Array, "*shape"]) -> Float[Array, " axis *shape"]:
+    """Forward differences along each axis longer than 1; the last one is 0."""
 
     def along(axis):
-        difference = jnp.roll(x, -1, axis) - x
-        return difference if wrap else difference.at[(slice(None),) * axis + (-1,)].set(0)
+        return (jnp.roll(x, -1, axis) - x).at[(slice(None),) * axis + (-1,)].set(0)
 
     axes = [axis for axis, size in enumerate(x.shape) if size > 1]
     return jnp.stack([along(axis) for axis in axes]) if axes else jnp.zeros((0, *x.shape), x.dtype)
 
 
-def differences_adjoint(u: Float[Array, " axis *shape"], *, wrap: bool) -> Float[Array, "*shape"]:
+def differences_adjoint(u: Float[Array, " axis *shape"]) -> Float[Array, "*shape"]:
     """Exact adjoint of `differences`: minus the divergence."""
-    x = jax.ShapeDtypeStruct(u.shape[1:], u.dtype)
-    return jax.linear_transpose(lambda x: differences(x, wrap=wrap), x)(u)[0]
+    return jax.linear_transpose(differences, jax.ShapeDtypeStruct(u.shape[1:], u.dtype))(u)[0]
 
 
 def magnitude(u: Float[Array, " axis *shape"]) -> Float[Array, "*shape"]:
     """Length of the gradient vector at each voxel; its derivative is 0 where the length is 0."""
     # A sum over an axis of two or three is slower than two or three terms.
     return safe_sqrt(sum((part * part for part in u), jnp.zeros(u.shape[1:], u.dtype)))
-
-
-def total_variation(u: Float[Array, " axis *shape"], *, isotropic: bool) -> Float[Array, ""]:
-    """Sum of the gradient's lengths (isotropic) or of the absolute values of the differences `u`."""
-    return jnp.sum(magnitude(u) if isotropic else jnp.abs(u))
-
-
-def shrink(u: Float[Array, " axis *shape"], threshold, *, isotropic: bool) -> Float[Array, " axis *shape"]:
-    """Proximal map of `threshold * total_variation`: soft thresholding of vectors (isotropic) or of components."""
-    if not isotropic:
-        return u - jnp.clip(u, -threshold, threshold)
-    length = magnitude(u)
-    return u * divide(jnp.maximum(length - threshold, 0), length)[None]

@@ -226,6 +226,6 @@ def _without_rounding(sensitivity):
 
 
 def _tv_denominator(x, tv):
-    u = differences(x, wrap=False)
-    curvature = differences_adjoint(divide(u, jnp.broadcast_to(magnitude(u)[None], u.shape)), wrap=False)
+    u = differences(x)
+    curvature = differences_adjoint(divide(u, jnp.broadcast_to(magnitude(u)[None], u.shape)))
     return jnp.maximum(1 + jnp.asarray(tv, x.dtype) * curvature, _MIN_DENOMINATOR)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
@@ -21,7 +20,7 @@ from ..base.errors import InputError
 from ..io import weights
 from ..io.provenance import Provenance
 from ..typing import PathLike
-from .base import Operator, UnmatchedAdjointOperator, as_image, blurred, check_options, kept_pixels, norm
+from .base import Operator, as_image, blurred, check_options, kept_pixels, norm
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
@@ -250,8 +249,8 @@ def initialize_unrolled(
 
 
 def _start_gradients(A, image, lucy: LucyState) -> ConjugateGradients:
-    x, forward = lucy.x, A.forward if isinstance(A, UnmatchedAdjointOperator) else A
-    residual_image = image - forward.mv(x) - bilinear_background(lucy.knots, image)
+    x = lucy.x
+    residual_image = image - A.mv(x) - bilinear_background(lucy.knots, image)
     # Where light is likely, it is likely in neighbours, too.
     variance = blurred(x) * divide(jnp.vdot(x, x), jnp.sum(x))
     residual = _least_squares_operator(A).T.mv(image)
@@ -279,8 +278,8 @@ def _where_kept(A: Operator) -> Array | None:
     return None if (kept := kept_pixels(A)) is None else kept > 0
 
 
-def _least_squares_operator(A: Operator) -> lx.AbstractLinearOperator:
-    return (A.least_squares or A.forward) if isinstance(A, UnmatchedAdjointOperator) else A
+def _least_squares_operator(A: Operator) -> Operator:
+    return getattr(A, "least_squares", A)
 
 
 def _rms(x):

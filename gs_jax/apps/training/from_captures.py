@@ -24,14 +24,14 @@ from ...geometry import Imager
 from ...grid import Grid
 from ...projection.forward_model import Optics
 from ...projection.operators import ImagingOperator
-from ...reconstruction.cross_validation import kept_pixels_of_folds
 from ...reconstruction.inverse_problem import (
     InverseProblem,
     lens_type_geometries,
     prepare_data,
     prepare_model,
 )
-from ...solvers.stepping import run_solver
+from ...reconstruction.residual import kept_pixels_of_folds
+from ...solvers.base import run_solver
 from ...solvers.unrolled import State as UnrolledState, Unrolled
 from ...typing import Image
 from .training_loop import Recipe, State, init, run_fixed_steps, train, unroll
@@ -152,7 +152,7 @@ def check_number(captures: Sequence) -> None:
 def prediction_loss(networks: Unrolled, capture: SplitCapture) -> Float[Array, ""]:
     """Squared error of the pixels predicted after the steps with networks."""
     light = jnp.asarray(capture.system.kept) * jnp.asarray(capture.light)
-    return _squared_error(unroll(networks, capture.system.operator, light, capture.start), capture)
+    return _squared_error(unroll(networks, capture.system, light, capture.start), capture)
 
 
 def _error_of_all_steps(networks: Unrolled, capture: SplitCapture, progress: Progress) -> float:

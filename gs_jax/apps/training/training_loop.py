@@ -152,7 +152,7 @@ def unrolled_loss(network: Unrolled, example: UnrolledExample) -> Float[Array, "
     The error itself is small for sparse scenes, which would count less than dense ones.
     """
     truth = jnp.asarray(example.truth)
-    volume = unroll(network, example.system.operator, jnp.asarray(example.light), example.start)
+    volume = unroll(network, example.system, jnp.asarray(example.light), example.start)
     start = network.estimate(example.start)
     error = jnp.mean((volume - truth) ** 2) / (jnp.mean(truth**2) + _START_SHARE * jnp.mean(start**2))
     return jnp.log10(error + _LEAST_ERROR)
@@ -221,5 +221,5 @@ def run_fixed_steps(
     networks: Unrolled, system: InverseProblem, light: Float[Array | np.ndarray, "row column"]
 ) -> UnrolledState:
     """The state after the steps without networks, which training does not change."""
-    step = lambda state, _: networks.step(system.operator, light, state)[:2]
-    return lax.scan(step, networks.init(system.operator, light), length=networks.first)[0]
+    step = lambda state, _: networks.step(system, light, state)[:2]
+    return lax.scan(step, networks.init(system, light), length=networks.first)[0]
