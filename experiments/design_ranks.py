@@ -71,8 +71,6 @@ BETTER = {
     "lenses_per_point": 1,
     "occupancy": -1,
     "volume_error": -1,
-    "crowded_precision_um": -1,
-    "scene_error": -1,
 }
 
 
@@ -190,7 +188,7 @@ def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1))
 
 def term_of(name: str, imager: Imager) -> float:
     """A term's worst value over its entries."""
-    at, term = Conditions(np.linspace(*SETTINGS.span, 3), largest_magnification=0.5), TERMS[name]
+    at, term = Conditions(np.linspace(*SETTINGS.span, 3)), TERMS[name]
     values = np.ravel(_value(term.function, imager, at, *([jax.random.key(0)] if term.random else [])))
     return float(values.min() if BETTER[name] > 0 else values.max())
 

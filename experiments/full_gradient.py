@@ -15,11 +15,11 @@ import numpy as np
 
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from experiments.common import Report, main
+from experiments.end_to_end import misfit_db
 from experiments.forward_model import PSF_PIXELS
 from gs_jax import backproject, forward
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
-from gs_jax.codesign.end_to_end import misfit_db
 
 
 def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:

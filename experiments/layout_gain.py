@@ -2,12 +2,12 @@
 
 The prescription, the plate, the number of lenses and their minimum spacing are fixed; only the centres move. The object
 fills most of the plate, and sub-images overlap. For each of five seeds, 200 Poisson-disc layouts are scored by the
-end-to-end loss (`gs_jax.codesign.end_to_end.reconstruction_loss`), and the best one is the competitor. From there Adam
+end-to-end loss (`experiments.end_to_end.reconstruction_loss`), and the best one is the competitor. From there Adam
 follows the gradient of the same loss, with other scenes at each step. Controls with as many lenses: the best of 200
 layouts in even rows over the whole plate, each lens displaced a little, as the optima suggest; and hexagonal lattices
 at the minimum spacing and spread as wide as the plate allows, which are not optimised. All are scored by PSNR on 30
 held-out scenes that the loss's model did not render (`experiments.layout_scenes`). The reconstruction is the same for
-all: normalised back-projection less its local background (`gs_jax.codesign.end_to_end.reconstruct`), and as a second
+all: normalised back-projection less its local background (`experiments.end_to_end.reconstruct`), and as a second
 method, for which nothing was optimised, ten steps of Richardson-Lucy on the same pixel-voxel lists.
 
     python -m experiments.layout_gain [--out DIR] [--seeds N]

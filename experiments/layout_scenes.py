@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from experiments.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax import Grid, Imager, ImagingOperator, MicrolensArray, Sensor, forward
 from gs_jax.base.progress import Progress
-from gs_jax.codesign.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax.metrics import quality
 from gs_jax.simulation.synthetic import Camera, electrons, expose
 from gs_jax.solvers.base import solve

@@ -20,6 +20,7 @@ from gs_jax.apps.explore.evaluation import complete_values, evaluate_design, mak
 from gs_jax.apps.explore.server import Server, Session
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
+from gs_jax.codesign.terms import TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
 from gs_jax.optics import psf
@@ -37,7 +38,7 @@ STUDY = Study.model_validate(
         "terms": [
             {"name": "thickness_mm", "at_most": 7.0},
             {"name": "lenses_per_point", "at_least": 3.0},
-            {"name": "ghosts", "at_most": 1.0},
+            {"name": "light_percent", "at_most": 1.0},
         ],
         "stages": [{"solver": "bfgs"}],
     }
@@ -116,7 +117,8 @@ def test_moves_compile_nothing(either):
     assert counts == counts[:1] * len(counts)
 
 
-def test_targets_and_assumptions_in_words(design):
+def test_targets_and_assumptions_in_words(design, monkeypatch):
+    monkeypatch.setitem(TERMS, "light_percent", TERMS["light_percent"]._replace(random=True))
     start = start_of(design, STUDY)
     moves = {"sensor_distance_mm": 7.0, "pitch_mm": 1.3 * make_sliders(design)["pitch_mm"].start}
     values = complete_values(make_sliders(design), moves)
@@ -125,7 +127,7 @@ def test_targets_and_assumptions_in_words(design):
     assert "Target missed: thickness: filters, plate and sensor distance (thickness_mm) is 8, not <= 7." in sentences
     for word in ("lenses_per_point", "out of focus", "mask"):
         assert any(word in each for each in sentences)
-    assert not any("ghosts" in each for each in sentences)
+    assert not any("light_percent" in each for each in sentences)
     wide = design.replace(radius_of_curvature_mm=0.35)
     values = complete_values(make_sliders(wide), {"radius_of_curvature_mm": 0.18})
     result = evaluate_design(start_of(wide, STUDY), values, evaluation.live_terms(STUDY))

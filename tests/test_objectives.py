@@ -27,7 +27,6 @@ from gs_jax.optics.raytrace import to_numpy
 # Off the raster of places, where a hole has a kink.
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))
 SIZES = ("fwhm_um", "rms_width_um", "half_light_radius_um")
-CONTINUOUS = [name for name, term in TERMS.items() if not term.random]
 
 
 class Case(NamedTuple):
@@ -47,7 +46,7 @@ def some_terms(case, names):
 @jax.jit
 def everything(imager, at):
     """All terms at once: compiled once."""
-    return {name: TERMS[name].function(imager, at) for name in CONTINUOUS}
+    return {name: TERMS[name].function(imager, at) for name in TERMS}
 
 
 def small_design(centers=CENTERS):
@@ -296,7 +295,7 @@ def test_gradients_are_finite_where_lenses_coincide_and_rays_are_lost():
     sums = lambda values: {name: jnp.sum(x) for name, x in everything(*candidate(*parent, values=values)).items()}
     found, slopes = jax.jit(lambda values: (sums(values), jax.jacrev(sums)(values)))(values)
     finite = lambda name: all(np.isfinite(x).all() for x in (found[name], *slopes[name].values()))
-    assert [name for name in CONTINUOUS if not finite(name)] == []
+    assert [name for name in TERMS if not finite(name)] == []
 
 
 @pytest.mark.integration
@@ -305,5 +304,5 @@ def test_in_single_precision(focused):
     single, double = everything(*jax.tree.map(low, focused)), everything(*focused)
     assert all(x.dtype == jnp.float32 for x in single.values())
     # 1e-7 of relative rounding, and of the differences that a defocus or a web is of numbers ten times as large.
-    for name in CONTINUOUS:
+    for name in TERMS:
         np.testing.assert_allclose(single[name], double[name], rtol=2e-3, atol=1e-3, err_msg=name)

@@ -28,7 +28,7 @@ from gs_jax import (
     random_layout,
     simulate,
 )
-from gs_jax.codesign.fisher import crowded_bound
+from gs_jax.codesign.linear_error import lost_power
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.projection.point_sources import forward_points, make_stamps
 
@@ -207,20 +207,21 @@ def test_quantities_are_means_over_the_heights_of_the_lenses():
     assert np.isfinite(slope).all()
 
 
-def test_bounds_of_points_and_volumes_see_the_pose():
+def test_the_error_of_volumes_sees_the_pose():
     """Objects that turn and move with the array are seen as before; a tilt changes what is seen."""
     # Level too, but of the structure of those that lean: compiled once.
     lenses = MicrolensArray(PLACES, size=(8.0, 8.0))
     level = Imager(lenses, Sensor((700, 720), 0.016), 5.8, 2.5, tilt=(0.0, 0.0))
     at = objectives.Conditions([19.0, 21.0])
     place = np.array([[0.4, -0.7]])
-    turned = dataclasses.replace(level, rotation=0.3, shift=(0.2, -0.1))
-    moved = place @ np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]) + np.array([0.2, -0.1])
-    jitted = jax.jit(lambda imager, place: jnp.linalg.norm(crowded_bound(imager, at, place), axis=1))
-    bound = lambda imager, place: np.asarray(jitted(imager, place))
-    np.testing.assert_allclose(bound(turned, moved), bound(level, place), rtol=1e-6)
+    # An eighth of a turn, which permutes the directions of frequencies.
+    turned = dataclasses.replace(level, rotation=np.pi / 4, shift=(0.2, -0.1))
+    moved = place @ (np.array([[1, 1], [-1, 1]]) / np.sqrt(2)) + np.array([0.2, -0.1])
+    jitted = jax.jit(lambda imager, place: lost_power(imager, at, place))
+    error = lambda imager, place: np.asarray(jitted(imager, place))
+    np.testing.assert_allclose(error(turned, moved), error(level, place), rtol=1e-6)
     leaning = dataclasses.replace(level, tilt=(0.05, 0.0))
-    assert (np.abs(bound(leaning, place) / bound(level, place) - 1) > 1e-3).all()
+    assert (np.abs(error(leaning, place) / error(level, place) - 1) > 1e-3).all()
 
 
 @pytest.mark.integration

@@ -31,7 +31,15 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
-from ..objectives.conditions import Conditions, by_type, clear_diameter, field_heights, field_radius, of_lenses
+from ..objectives.conditions import (
+    Conditions,
+    by_type,
+    clear_diameter,
+    field_heights,
+    field_radius,
+    finite_plate,
+    of_lenses,
+)
 from ..objectives.quantities import occupancy
 from ..optics import theory
 from ..optics.pupil import pupil_quadrature
@@ -43,6 +51,21 @@ FILL, LENGTH = 0.03, 0.05
 READ_NOISE = 2.0
 # Nodes of the quadrature over frequencies, up to Nyquist of voxels of 40 um.
 _NODES = 16
+# Places along a side of the part of the plate whose points see a whole field of lenses.
+_PLACES = 2
+
+
+def volume_error(imager: Imager, at: Conditions) -> Float[Array, ""]:
+    """Relative error of volumes by the best linear estimate: the root of the mean of `lost_power` over the depths."""
+    return jnp.sqrt(jnp.mean(lost_power(imager, at, _places(imager))))
+
+
+def _places(imager: Imager) -> Float[Array, "place 2"]:
+    """Four points that stand for the plate, mm: a field radius from its edge, if it is large."""
+    plate = finite_plate(imager)
+    inner = jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
+    side = jnp.asarray((np.arange(_PLACES) + 0.5) / _PLACES - 0.5, inner.dtype)
+    return jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * inner[None]
 
 
 def lost_power(imager: Imager, at: Conditions, places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
@@ -121,8 +144,6 @@ def _spectrum(frequency):
 AWAY, PLACE = 20.0, 0.04
 # Rings of rays: enough for spots twenty periods wide.
 _RINGS = 16
-# Frequencies between which the transfer function of a spot is interpolated.
-_READ = 24
 # Directions of frequencies over half a turn.
 _DIRECTIONS = 4
 
@@ -168,25 +189,6 @@ def transfer_power(
     cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, clear_diameter(imager, at))
     others = theory.ideal_mtf(frequencies, cutoff) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
     return mean * (others**2)[None]
-
-
-@by_type
-def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size size"]:
-    """Symmetric spots with the modulus of the transfer function, on the sensor's pixels, of sum 1: PSFs for `forward`.
-
-    They lack the phase of the transfer function. Light beyond the window is folded back into it. The square root of
-    `transfer_power` is interpolated between 24 frequencies.
-
-    `size`: pixels along a side, odd.
-    """
-    dtype, pixel = at.depths.dtype, imager.sensor.pixel_pitch
-    own = jnp.asarray(np.linspace(0, np.sqrt(0.5), _READ), dtype)
-    modulus = safe_sqrt(transfer_power(imager, at, own / pixel))
-    along = np.fft.fftfreq(size)
-    away = jnp.asarray(np.hypot(along[:, None], along[None]), dtype)
-    table = jax.vmap(lambda values: jnp.interp(away, own, values))(modulus)
-    light = jnp.maximum(jnp.fft.fftshift(jnp.real(jnp.fft.ifft2(table)), axes=(1, 2)), 0)
-    return light / jnp.sum(light, (1, 2), keepdims=True)
 
 
 @by_type

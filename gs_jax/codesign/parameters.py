@@ -10,8 +10,7 @@ in the order of their first lenses; the type of each lens stays.
 """
 
 import dataclasses
-from collections.abc import Mapping
-from types import MappingProxyType
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +21,6 @@ from pydantic import ValidationError
 
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
-from ..design.conversion import reduced_depth, reduced_sensor_distance
 from ..design.design import Design
 from ..geometry import Imager
 from ..io.toml import one_line
@@ -156,7 +154,7 @@ def evaluated(
     circle_of_confusion: float | None = None,
     depth_count: int = 6,
     exposure: float = 1e4,
-    free: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    free: Collection[str] = (),
 ) -> tuple[Imager, Conditions]:
     """The imager of a design and the conditions under which a search evaluates it.
 
@@ -171,7 +169,7 @@ def evaluated(
     exposure
         As of `Conditions`.
     free
-        Bounds of the parameters that will be replaced. Free lens centres take longer.
+        Names of the parameters that will be replaced. Free lens centres take longer.
     """
     near, far = depths_mm or design.imaging.working_distance_mm
     imager = design.imager()
@@ -183,7 +181,6 @@ def evaluated(
         depths_between(jnp.asarray((near + far) / 2, dtype), jnp.asarray(far - near, dtype), depth_count),
         circle_of_confusion,
         exposure=exposure,
-        largest_magnification=_largest_magnification(design, near, far, free),
         directions=_EDGES,
         cells=voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if fixed else None,
     )
@@ -193,18 +190,6 @@ def evaluated(
 def depths_between(middle: Float[Array, ""], span: Float[Array, ""], count: int) -> Float[Array, " depth"]:
     """Evenly spaced depths about a middle, mm."""
     return middle + span * jnp.linspace(-0.5, 0.5, count, dtype=middle.dtype)
-
-
-def _largest_magnification(design: Design, near: float, far: float, free: Mapping[str, tuple[float, float]]) -> float:
-    """`v'/z'` (Eq. 3) with the farthest sensor, nearest depth and highest index, of the design and of the bounds."""
-    most = lambda name, own: max(own, free.get(name, (own, own))[1])
-    least = lambda name, own: min(own, free.get(name, (own, own))[0])
-    # Of an index that is free the one that makes it largest: the plate is in front, or behind.
-    in_front = design.lens.orientation == "plano"
-    index = (most if in_front else least)("refractive_index", design.refractive_index)
-    nearest = (near + far - most("depth_span_mm", far - near)) / 2
-    distance = most("sensor_distance_mm", design.imaging.sensor_distance_mm)
-    return reduced_sensor_distance(design, distance, index) / reduced_depth(design, nearest, index)
 
 
 def _fields_of(imager: Imager) -> dict[str, str]:

@@ -3,7 +3,6 @@
 `gs_jax.codesign.search` runs them once, `gs_jax.codesign.pareto` once for each combination of limits.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -40,11 +39,6 @@ from .solve import (
 from .study import StageTable, Study, TermTable, labels
 from .targets import Objective, Row, assess, evaluate, worst_entry
 from .terms import TERMS, Term, with_terms
-
-# Most lens types of the term that images scenes by each in turn.
-_SCENE_TYPES = 8
-# Steps to which the largest magnification is rounded up, per 1.
-_PER_UNIT = 8
 
 
 class Problem(NamedTuple):
@@ -113,16 +107,10 @@ def problem_of(design: Design, study: Study) -> Problem:
     _check_free(design, study)
     circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
     where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
-    imager, at = evaluated(design, **where, exposure=study.exposure, free=study.free)
-    # It decides the shapes of windows: a few sizes, so that other numbers find the programs.
-    largest = math.ceil(at.largest_magnification * _PER_UNIT) / _PER_UNIT
-    return Problem(imager, dataclasses.replace(at, largest_magnification=largest), study)
+    return Problem(*evaluated(design, **where, exposure=study.exposure, free=study.free), study)
 
 
 def _check_free(design: Design, study: Study) -> None:
-    count = design.imager().array.type_count
-    if count > _SCENE_TYPES and any(term.name == "scene_error" for term in study.terms):
-        raise InputError(f"`terms`: scene_error takes up to {_SCENE_TYPES} lens types, got {count}.")
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm` needs a design of two lenses or more, got one lens.")
     _check_room(design, study)

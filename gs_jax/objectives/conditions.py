@@ -35,8 +35,6 @@ class Conditions(eqx.Module):
         Diameter of the circle of confusion, mm; two pixels by default.
     exposure
         Electrons that a mm^2 of clear aperture collects from an emitter of 40 um x 40 um, 20 mm away in air.
-    largest_magnification
-        An upper bound of all magnifications, for windows whose shape may not depend on traced numbers.
     directions
         Number of directions in which the edge of a clear aperture is computed, where lenses differ.
     cells
@@ -61,7 +59,6 @@ class Conditions(eqx.Module):
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     circle_of_confusion: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     exposure: Float[Array, ""] = eqx.field(converter=as_float, default=1e4)
-    largest_magnification: float = eqx.field(static=True, default=math.inf)
     directions: int = eqx.field(static=True, default=512)
     cells: VoronoiCells | None = None
     clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
@@ -178,7 +175,7 @@ def _alone(imager: Imager, at: Conditions) -> tuple[Imager, Conditions]:
     """A lens alone, with what decides shapes of other quantities left out."""
     sensor = dataclasses.replace(imager.sensor, shape=(2, 2), origin=(0.0, 0.0))
     alone = dataclasses.replace(imager, array=imager.array.lens(0), sensor=sensor)
-    return alone, dataclasses.replace(at, cells=None, lenses=None, directions=1, largest_magnification=math.inf)
+    return alone, dataclasses.replace(at, cells=None, lenses=None, directions=1)
 
 
 @eqx.filter_jit

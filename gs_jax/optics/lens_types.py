@@ -9,9 +9,8 @@ import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Float64, Int
+from jaxtyping import ArrayLike, Float, Float64, Int
 
 from ..base.caches import cache_by_value
 from ..base.errors import InputWarning
@@ -53,13 +52,6 @@ def lens_groups(imager: Imager) -> tuple[tuple[int, ...], ...]:
 def split_by_type(imager: Imager, lenses: Sequence[Sequence[int]]) -> list[Imager]:
     """The imager with the lenses of each type alone, whose apertures the other lenses still bound."""
     return [eqx.tree_at(lambda i: i.array, imager, imager.array.subset(which)) for which in lenses]
-
-
-def only(imager: Imager, lenses: Bool[Array, " lens"] | None) -> Imager:
-    """The imager with the other lenses out of sight of every object, for lenses that JAX traces; None keeps all."""
-    if lenses is None:
-        return imager
-    return eqx.tree_at(lambda i: i.array.centers, imager, jnp.where(lenses[:, None], imager.array.centers, _FAR))
 
 
 def split_groups(imager: Imager) -> tuple[list[Imager], tuple[tuple[int, ...], ...]]:

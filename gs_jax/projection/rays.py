@@ -6,14 +6,13 @@ number and a column number: per lens `2 x depths x patch` of them instead of `de
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..geometry import Imager, chief_ray, envelope, field_limit
-from ..grid import Grid, Sensor
+from ..grid import Grid
 from ..optics.psf_core import ring_light
 from ..typing import Scalar
 
@@ -196,45 +195,3 @@ def interpolate(corners, down, right):
     lower = lower_left + right * (lower_right - lower_left)
     along_x = (1 - down) * (upper_right - upper_left) + down * (lower_right - lower_left)
     return upper + down * (lower - upper), lower - upper, along_x
-
-
-def crop_field(
-    imager: Imager, grid: Grid, place: Float[Array | np.ndarray, "2"], shape: tuple[int, int]
-) -> tuple[Imager, Grid, Bool[Array, "row column"]]:
-    """An imager and a grid of a part of the field, for what does not fit into memory at once.
-
-    Their origin is at `place`, so that a centred grid lies around the place; lenses and sensor are moved by `-place`,
-    rounded to whole pixels (half of one if the shapes differ by an odd number). A voxel at `q` from the place is imaged
-    up to `|q| + (1 + M) field_radius` from it; light beyond the new sensor is lost.
-
-    Parameters
-    ----------
-    imager
-        The whole.
-    grid
-        Voxels about the place.
-    place
-        `(x, y)`, mm.
-    shape
-        `(rows, columns)` of the new sensor.
-
-    Returns
-    -------
-    tuple
-        The imager; the grid, whose depths are from the array's front at the place, where a tilted array is higher than
-        on the axis; and which pixels are on the sensor of the whole.
-    """
-    sensor = imager.sensor
-    whole = jnp.array(sensor.shape, place.dtype)
-    origin = jnp.array(sensor.origin, place.dtype)
-    margin = (whole - jnp.array(shape, place.dtype)) / 2
-    # The new sensor's first pixel on the whole sensor.
-    corner = jax.lax.stop_gradient(jnp.round((place - origin)[::-1] / sensor.pixel_pitch + margin))
-    moved = origin + (corner - margin)[::-1] * sensor.pixel_pitch
-    rows, columns = (
-        (first + jnp.arange(size) >= 0) & (first + jnp.arange(size) < total)
-        for first, size, total in zip(corner.astype(int), shape, sensor.shape, strict=True)
-    )
-    imager = eqx.tree_at(lambda i: i.sensor, imager, Sensor(shape, sensor.pixel_pitch)).moved(moved)
-    height = 0 if imager.tilt is None else moved @ imager.tilt
-    return imager, grid.at(grid.depths - height), rows[:, None] & columns[None]

@@ -122,12 +122,9 @@ def complete_values(sliders: dict[str, Slider], values: Values) -> Values:
 
 
 def live_terms(study: Study | None) -> tuple[str, ...]:
-    """Names of the study's terms that are evaluated at each move.
-
-    Random terms are left out, and `lens_shortage`, which needs the field radius when it is compiled.
-    """
+    """Names of the study's terms that are evaluated at each move; random terms are left out."""
     names = () if study is None else tuple(table.name for table in study.terms)
-    return tuple(name for name in names if not TERMS[name].random and name != "lens_shortage")
+    return tuple(name for name in names if not TERMS[name].random)
 
 
 class Evaluation(NamedTuple):

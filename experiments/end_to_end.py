@@ -1,27 +1,23 @@
 """End-to-end loss: how well random scenes are reconstructed from their noisy images by back-projection.
 
 `reconstruction_loss` is an estimate from a few random scenes, differentiable with respect to the imager, for stochastic
-optimisers. One key gives one smooth function. With `window` a scene lies at a random position of the sensor and only
-the window around it is computed, so the full field need not fit into memory.
+optimisers. One key gives one smooth function.
 
 The reconstruction is normalised `backproject` minus its local background: light from other depths gives a smooth haze
 whose low frequencies no layout can remove, because the lenses that see a point lie within one field radius.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..geometry import Imager
-from ..grid import Grid
-from ..projection.backprojection import backproject
-from ..projection.forward_model import forward
-from ..projection.rays import crop_field
-from ..typing import Real
+from gs_jax.geometry import Imager
+from gs_jax.grid import Grid
+from gs_jax.projection.backprojection import backproject
+from gs_jax.projection.forward_model import forward
+from gs_jax.typing import Real
 
 Volume = Float[Array | np.ndarray, "depth y x"]
 # Default side of the PSF of a voxel, pixels: three standard deviations of voxels up to 5 pixels wide.
@@ -71,7 +67,6 @@ def reconstruct(
     grid: Grid,
     *,
     background_width: Real,
-    lit: Bool[Array, "row column"] | None = None,
 ) -> Float[Array, "depth y x"]:
     """Local contrast of the back-projection, normalised by the sum of weights.
 
@@ -81,8 +76,6 @@ def reconstruct(
         As for `backproject`.
     background_width
         Of `local_contrast`, mm.
-    lit
-        Mask of the pixels that exist, all by default. Others have neither light nor weight.
 
     Returns
     -------
@@ -90,9 +83,8 @@ def reconstruct(
         `grid.volume_shape`. A voxel with less weight than half a lens on its axis is dimmed in proportion, so that
         the edge of the field is smooth.
     """
-    seen = jnp.ones(image.shape, image.dtype) if lit is None else lit.astype(image.dtype)
-    weight = backproject(seen, imager, grid)
-    mean = backproject(image * seen, imager, grid) / jnp.maximum(weight, _LEAST_WEIGHT)
+    weight = backproject(jnp.ones(image.shape, image.dtype), imager, grid)
+    mean = backproject(image, imager, grid) / jnp.maximum(weight, _LEAST_WEIGHT)
     return local_contrast(mean, grid, width=background_width)
 
 
@@ -160,10 +152,6 @@ def reconstruction_loss(
     electrons: Real = 1000.0,
     read_noise: Real = 2.0,
     background_width: Real = 0.2,
-    margin: int = 0,
-    window: tuple[int, int] | None = None,
-    field: tuple[float, float] = (0.0, 0.0),
-    types: Sequence[tuple[Imager, Float[Array, "plane tall wide"], Real]] = (),
 ) -> Float[Array, ""]:
     """Mean misfit of random scenes that are imaged with noise and reconstructed, dB; lower is better.
 
@@ -188,15 +176,6 @@ def reconstruction_loss(
         Standard deviation, electrons.
     background_width
         Of `local_contrast`, mm. A few times `width`.
-    margin
-        Voxels along each side that are lit but do not count.
-    window
-        `(rows, columns)` of the part of the sensor that is computed. By default the whole sensor, and the grid on the
-        axis; for a smaller part, the grid's middle is uniform over `field`.
-    field
-        `(x, y)` of the rectangle of these positions, centred on the sensor, mm.
-    types
-        Lenses of each type with their own PSF and electrons, in place of `psf` and `electrons`.
 
     Returns
     -------
@@ -206,27 +185,17 @@ def reconstruction_loss(
     Raises
     ------
     ValueError
-        If nothing is left between the margins, `scenes` is not positive, or as `forward`.
+        If `scenes` is not positive, or as `forward`.
     """
     if scenes < 1:
         raise ValueError(f"`scenes` must be 1 or more, got {scenes}.")
-    if not 0 <= 2 * margin < min(grid.shape):
-        raise ValueError(f"`margin` must be 0 or more and leave voxels of {grid.shape}, got {margin}.")
-    inner = np.s_[:, margin : grid.shape[0] - margin, margin : grid.shape[1] - margin]
-    dtype = imager.sensor_distance.dtype
-    parts = [(one, footprints(one, grid, own), light) for one, own, light in types or [(imager, psf, electrons)]]
+    images = footprints(imager, grid, psf)
 
     def one(key):
-        scene_key, noise_key, place_key = jax.random.split(key, 3)
-        place = jax.random.uniform(place_key, (2,), dtype, -0.5, 0.5) * jnp.asarray(field, dtype)
-        place = place + jnp.asarray(imager.sensor.origin, dtype)
-        cut = lambda whole: (whole, grid, None) if window is None else crop_field(whole, grid, place, window)
-        local, local_grid, lit = cut(imager)
+        scene_key, noise_key = jax.random.split(key)
         truth = random_scene(scene_key, grid, density=density, width=width)
-        light = sum(electrons * forward(truth, cut(one)[0], local_grid, images) for one, images, electrons in parts)
-        image = noisy(noise_key, jnp.asarray(light), read_noise)
-        estimate = reconstruct(image, local, local_grid, background_width=background_width, lit=lit)
-        return misfit_db(estimate[inner], truth[inner])
+        image = noisy(noise_key, electrons * forward(truth, imager, grid, images), read_noise)
+        return misfit_db(reconstruct(image, imager, grid, background_width=background_width), truth)
 
     return jnp.mean(lax.map(one, jax.random.split(key, scenes)))
 
