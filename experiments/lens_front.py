@@ -27,8 +27,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.pareto import searcher, sweep_of
-from gs_jax.codesign.search import initial_design
-from gs_jax.codesign.study import Study, read_study
+from gs_jax.codesign.study import Study, initial_design, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.conversion import reduced_depth
 from gs_jax.design.design import Design, read_design
@@ -68,7 +67,7 @@ def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
     free = {name: bounds for name, bounds in data["free"].items() if kind.conic or name != "conic_constant"}
     return Study.model_validate(
         data
-        | {"depths_mm": span, "depth_count": PLANES, "kinds": kind.foci, "orientation": None, "free": free, "starts": 1}
+        | {"depths_mm": span, "depth_count": PLANES, "types": kind.foci, "orientation": None, "free": free, "starts": 1}
         | {"terms": kept, "pareto": [{"name": "light_percent", side: [1.0]} for side in sides]}
         | {
             "stages": [

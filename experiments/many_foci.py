@@ -3,7 +3,7 @@
 The search minimises the error of the best linear estimate of a volume (`volume_error`): transfer functions of exact
 rays, light, shot and read noise at equal exposure, and parallax. Free are the sensor distance, and the radius of
 curvature and aperture of each type, up to what a mask leaves of the nearest neighbours. Types are interleaved so that
-neighbours differ (`kinds` of a study), and start from the result for one type, with their radii spread. The spans are
+neighbours differ (`types` of a study), and start from the result for one type, with their radii spread. The spans are
 18 to 23 mm and a longer one, over which one focus is a compromise. Each search runs for several layouts of the same
 statistics, the same for all numbers of types; gains are paired, with intervals by Student's t over the layouts. The
 result for the first layout is then tested on a task that was not optimised: letters at three depths of the span, imaged
@@ -70,11 +70,11 @@ def study_of(span: tuple[float, float], planes: int, kinds: int, steps: int) -> 
         {
             "depths_mm": span,
             "depth_count": planes,
-            "kinds": kinds,
+            "types": kinds,
             "free": BOUNDS,
             "terms": [
                 {"name": "volume_error", "minimise": 0.1},
-                {"name": "web_mm", "at_least": WEB, "weight": 30.0},
+                {"name": "min_wall_mm", "at_least": WEB, "weight": 30.0},
             ],
             "stages": [{"solver": "bfgs", "steps": steps}],
         }

@@ -4,7 +4,8 @@ from .base.errors import InputError as InputError
 from .base.progress import Progress as Progress
 from .calibration.fit import calibrate as calibrate
 from .codesign.parameters import free as free
-from .codesign.search import optimize as optimize, run_study as run_study
+from .codesign.search import run_study as run_study
+from .codesign.solve import optimize as optimize
 from .codesign.study import read_study as read_study
 from .design.design import Design as Design, read_design as read_design, write_design as write_design
 from .design.start import geomscope as geomscope

@@ -1,16 +1,14 @@
 import json
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gs_jax.base.errors import InputError
-from gs_jax.codesign import search, stages
+from gs_jax.codesign import search
 from gs_jax.codesign.parameters import start_values
-from gs_jax.codesign.search import run_study
+from gs_jax.codesign.search import Log, problem_of, read_checkpoint, run_study
 from gs_jax.codesign.search_report import before_and_after, check_outputs, picture, write_outcome
-from gs_jax.codesign.solve import NOT_FINITE, Log, read_checkpoint
-from gs_jax.codesign.stages import problem_of, random_start
+from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope
@@ -88,7 +86,7 @@ def test_files(table1, outcome, tmp_path):
     assert [term["met_after"] for term in numbers["terms"]] == [True] * 4
     assert len(numbers["starts"]) == 2 and numbers["steps"][0]["step"] == 1
     # Parameters in the units of their keys; those of the best start are the design's.
-    best = numbers["starts"][stages.best_end(outcome.log, 0)["start"]]["free"]
+    best = numbers["starts"][outcome.log.best_end(0)["start"]]["free"]
     assert best["sensor_distance_mm"] == pytest.approx(written.imaging.sensor_distance_mm, abs=1e-4)
     assert all(FREE[name][0] <= end["free"][name] <= FREE[name][1] for end in numbers["starts"] for name in FREE)
     assert before_and_after(outcome).row_count == 4
@@ -134,7 +132,7 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path.write_bytes(b"{}\n")
     with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
-    path.write_bytes(b'{"format": "gs-jax checkpoint 4", "of": "", "log": {"steps": 1, "ends": 2}}\n')
+    path.write_bytes(b'{"format": "gs-jax checkpoint 5", "of": "", "log": {"steps": 1, "ends": 2}}\n')
     with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
     interrupted(table1, study(), path, monkeypatch, writes=1)
@@ -150,11 +148,11 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
 def test_random_starts(table1):
     problem = problem_of(table1, study())
     values = start_values(problem.imager, problem.at)
-    assert random_start(problem, values, 0) == values
-    first, second = (random_start(problem, values, start) for start in (1, 2))
+    assert problem.start(values, 0) == values
+    first, second = (problem.start(values, number) for number in (1, 2))
     assert all(FREE[name][0] < first[name] < FREE[name][1] and first[name] != second[name] for name in FREE)
     assert first["centers_mm"] is values["centers_mm"]
-    assert random_start(problem, values, 1) == first
+    assert problem.start(values, 1) == first
 
 
 def test_lens_centres_can_be_free():
@@ -197,7 +195,7 @@ def test_the_record_is_that_of_the_start_that_won():
         {"stage": 0, "start": 2, "cost": 2.0, "met": True, "reason": "lost"},
         {"stage": 0, "start": 3, "cost": 0.5, "met": False, "reason": "missed"},
     ]
-    assert stages.best_end(Log(ends=ends), 0)["reason"] == "won"
+    assert Log(ends=ends).best_end(0)["reason"] == "won"
 
 
 def test_both_limits_of_a_term_are_recorded(table1):
@@ -211,7 +209,7 @@ def test_both_limits_of_a_term_are_recorded(table1):
 
 
 def test_no_start_that_ends_anywhere(table1, monkeypatch):
-    monkeypatch.setattr(stages, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
+    monkeypatch.setattr(search.TermTable, "target", float("nan"))
     with pytest.raises(InputError, match="no start reached a finite cost"):
         run_study(table1, study())
 

@@ -12,9 +12,8 @@ from jax.test_util import check_grads
 from gs_jax import objectives, random_layout
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.parameters import candidate, evaluated, new_design, start_values
-from gs_jax.codesign.search import initial_design, run_study
-from gs_jax.codesign.stages import problem_of
-from gs_jax.codesign.study import Study
+from gs_jax.codesign.search import problem_of, run_study
+from gs_jax.codesign.study import Study, initial_design
 from gs_jax.codesign.terms import _OURS, TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
@@ -49,13 +48,13 @@ def study(**changes):
 
 
 def two_kinds(**options):
-    design = initial_design(conics(**options), study(kinds=2))
+    design = initial_design(conics(**options), study(types=2))
     return design, evaluated(design, depths_mm=(15.0, 30.0), depth_count=3)
 
 
 def test_lenses_are_dealt_with_radii_spread_over_the_depths():
     """From 15 to 30 mm: paraxial foci are a third of the vergences apart, that of the middle kind in their middle."""
-    design = initial_design(conics(), study(kinds=3))
+    design = initial_design(conics(), study(types=3))
     radii = np.array(design.lens.radius_of_curvature_mm)
     which = interleave(np.array(design.array.centers_mm), 3)
     np.testing.assert_array_equal(radii, np.unique(radii)[which])
@@ -65,19 +64,19 @@ def test_lenses_are_dealt_with_radii_spread_over_the_depths():
     vergence = (0.05 + behind) / focal - behind  # 1/f - 1/v', for the middle kind in focus at 1/20
     np.testing.assert_allclose(vergence, [11 / 180, 0.05, 7 / 180], rtol=1e-9)
     assert middle == pytest.approx(1.34)
-    assert initial_design(design, study(kinds=3)) is design and initial_design(design, study()) is design
-    assert initial_design(conics(), study(kinds=1)) == conics()
+    assert initial_design(design, study(types=3)) is design and initial_design(design, study()) is design
+    assert initial_design(conics(), study(types=1)) == conics()
 
 
 def test_kinds_that_cannot_be():
-    three = initial_design(conics(), study(kinds=3))
-    with pytest.raises(InputError, match="`kinds` must be 3, .*, got 2"):
-        initial_design(three, study(kinds=2))
-    with pytest.raises(InputError, match="`kinds` must be at most 4, .*, got 5"):
-        initial_design(conics(4, 2.4), study(kinds=5))
+    three = initial_design(conics(), study(types=3))
+    with pytest.raises(InputError, match="`types` must be 3, .*, got 2"):
+        initial_design(three, study(types=2))
+    with pytest.raises(InputError, match="`types` must be at most 4, .*, got 5"):
+        initial_design(conics(4, 2.4), study(types=5))
     thin = conics().model_copy(update={"lens": conics().lens.model_copy(update={"focal_length_mm": 4.65})})
-    with pytest.raises(InputError, match="`kinds` needs a design without"):
-        initial_design(thin, study(kinds=2))
+    with pytest.raises(InputError, match="`types` needs a design without"):
+        initial_design(thin, study(types=2))
 
 
 @pytest.mark.integration
@@ -132,7 +131,7 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
 @pytest.mark.integration
 def test_every_lens_may_be_a_kind_of_its_own():
     """The best of all is the best of what each has alone, and a search takes them."""
-    twelve = study(kinds=12, terms=[{"name": "psf_width_um", "minimise": 100.0}], depth_count=2)
+    twelve = study(types=12, terms=[{"name": "psf_width_um", "minimise": 100.0}], depth_count=2)
     design, depths = initial_design(conics(), twelve), np.array([15.0, 30.0])
     alone = [objectives.spot_width(*part) for part in per_type(design.imager(), depths)]
     np.testing.assert_allclose(objectives.spot_width(design.imager(), depths), np.min(alone, 0), rtol=1e-9)
@@ -162,14 +161,14 @@ def test_webs_are_between_apertures_of_their_own_size():
         min(np.hypot(*(centers[i] - centers[j])) - (each[i] + each[j]) / 2 for j in range(12) if j != i)
         for i in range(12)
     ]
-    np.testing.assert_allclose(TERMS["web_mm"].function(*found), least, rtol=1e-12)
+    np.testing.assert_allclose(TERMS["min_wall_mm"].function(*found), least, rtol=1e-12)
 
 
 @pytest.mark.integration
 def test_gradients():
     """By what is free of each kind, apart and where discs overlap; every entry, so that ties do not matter."""
     _, parent = two_kinds()
-    names = ("volume_error", "light_percent", "web_mm", "psf_width_um", "width_per_light_um")
+    names = ("volume_error", "light_percent", "min_wall_mm", "psf_width_um", "width_per_light_um")
     values = {
         name: start_values(*parent)[name] for name in ("radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm")
     }
@@ -194,7 +193,7 @@ def searches():
     """The same search of one kind, and of two from where that ended."""
     free = {"radius_of_curvature_mm": [1.0, 3.0], "sensor_distance_mm": [2.0, 6.0]}
     one = run_study(conics(), study(free=free))
-    return one, run_study(one.design, study(free=free, kinds=2))
+    return one, run_study(one.design, study(free=free, types=2))
 
 
 @pytest.mark.integration
@@ -212,7 +211,7 @@ def test_two_foci_are_better_over_a_long_span(searches):
 def test_what_is_found_goes_on_as_a_design_of_two_kinds(searches):
     """What is written is read as its kinds, and judged as it was."""
     design = searches[1].design
-    again = problem_of(design, study(kinds=2))
+    again = problem_of(design, study(types=2))
     assert len(lenses_by_type(again.imager.array)) == 2
     value = TERMS["volume_error"].function(*candidate(again.imager, again.at, {}))
     assert float(value) == pytest.approx(searches[1].after[0].high, rel=1e-6)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from gs_jax.codesign.stages import problem_of
+from gs_jax.codesign.search import problem_of
 from gs_jax.codesign.study import read_study
 from gs_jax.design.datasheets import datasheet, summary, tables
 from gs_jax.design.design import read_design, write_design

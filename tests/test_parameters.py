@@ -7,7 +7,6 @@ from jax.test_util import check_grads
 from gs_jax import objectives
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.parameters import NAMES, candidate, evaluated, new_design, start_values
-from gs_jax.codesign.solve import Bounds
 from gs_jax.design.start import geomscope
 from gs_jax.layouts import coverage
 from gs_jax.optics.apertures import clear_diameter, pitch
@@ -23,33 +22,6 @@ def design():
 @pytest.fixture(scope="module")
 def parent(design):
     return evaluated(design, depths_mm=(18.0, 23.0), circle_of_confusion=0.036)
-
-
-def test_bounds_are_invertible_from_the_number():
-    """To 4.9 the value stays 1 % of the range from its bounds; the curve is flat there, and rounding grows by its
-    inverse slope, 2 (1 + x^2)^(3/2) = 250."""
-    bounds, free = Bounds(2.0, 6.0), np.linspace(-4.9, 4.9, 99)
-    np.testing.assert_allclose(jax.jit(lambda x: bounds.free(bounds.value(x)))(free), free, atol=1e-12)
-
-
-def test_bounds_are_invertible_from_the_value():
-    bounds, value = Bounds(-1.0, 3.0), np.linspace(-0.96, 2.96, 99)
-    np.testing.assert_allclose(jax.jit(lambda x: bounds.value(bounds.free(x)))(value), value, atol=1e-12)
-
-
-def test_a_start_at_a_bound_can_still_move():
-    bounds = Bounds(2.0, 6.0)
-    value, slope = jax.jit(jax.vmap(lambda x: jax.value_and_grad(bounds.value)(bounds.free(x))))(
-        np.array([2.0, 6.0, 1.0, 9.0])
-    )
-    # The slope at a share s is 4 (s (1 - s))^(3/2) of the half range: 0.008 for 1 %.
-    assert np.all((2 < np.asarray(value)) & (np.asarray(value) < 6)) and np.all(np.asarray(slope) > 0.005)
-
-
-def test_bounds_have_gradients():
-    bounds = Bounds(2.0, 6.0)
-    check_grads(jax.jit(lambda x: bounds.value(x)), (jnp.array([0.3, -4.0]),), order=2)
-    check_grads(jax.jit(lambda x: bounds.free(x)), (jnp.array([2.5, 5.9]),), order=1)
 
 
 @jax.jit

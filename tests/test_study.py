@@ -9,8 +9,8 @@ import gs_jax as gs
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import terms
 from gs_jax.codesign.parameters import NAMES
-from gs_jax.codesign.study import KINDS, Solver, Study, TermTable, parent_path, read_study
-from gs_jax.codesign.terms import TERMS, Term, add_terms
+from gs_jax.codesign.study import Solver, Study, TermTable, parent_path, read_study
+from gs_jax.codesign.terms import KINDS, TERMS, Term, add_terms
 
 ROOT = Path(__file__).parents[1]
 STUDIES = sorted(p for folder in ("design", "experiments/designs") for p in (ROOT / folder / "studies").glob("*.toml"))
@@ -89,6 +89,14 @@ def test_a_wrong_study_is_explained_in_one_line(read, old, new, found):
     with pytest.raises(InputError, match=found) as error:
         read(STUDY.replace(old, new))
     assert "study.toml" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_names_of_earlier_versions_are_read(read):
+    old = STUDY.replace("depths_mm", "kinds = 2\ndepths_mm").replace("occupancy", "web_mm")
+    study = read(f'{old}terms = ["web_mm"]\n')
+    assert study.types == 2 and study.terms[0].name == "min_wall_mm" and study.stages[0].terms == ("min_wall_mm",)
+    with pytest.raises(InputError, match="`kinds`: no such key"):
+        read(f"types = 2\n{old}")
 
 
 def test_a_study_without_a_design(read, tmp_path):

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
@@ -24,12 +23,9 @@ from ..base.workers import Workers
 from ..design.design import Design
 from ..typing import PathLike
 from .parameters import NAMES, Values, significant, start_values
-from .search import load
-from .solve import Log
-from .stages import Problem, make_stage, problem_of, rows_of, run_stages, warn_of_start
-from .study import Study, TermTable
-from .targets import SIGNS, Row, assess, worst_entry
-from .terms import unit_of, with_terms
+from .search import Log, Problem, load, problem_of, run_stages, warn_of_start
+from .study import Row, Study, TermTable
+from .terms import SIGNS, unit_of, with_terms
 
 # Relative gain of the goal below which two searches have found the same design.
 _LEAST_GAIN = 1e-6
@@ -172,7 +168,7 @@ def _neighbours(combinations: list[tuple[float, ...]]) -> list[list[int]]:
 def _with_limits(sweep: Sweep, point: Point, limits: tuple[float, ...]) -> Point:
     """The design of a point, assessed under other limits."""
     terms = _with_targets(sweep.kept, sweep.moving, limits)
-    rows = [assess(term, np.array(row[:2])) for term, row in zip(terms, point.rows, strict=True)]
+    rows = [term.assess(row[:2]) for term, row in zip(terms, point.rows, strict=True)]
     return Point(point.values, rows, limits)
 
 
@@ -180,7 +176,7 @@ def _rank(sweep: Sweep, point: Point) -> tuple[bool, float]:
     """Less is better: first whether a target is missed, then the goal."""
     number = next(number for number, term in enumerate(sweep.kept) if term.is_goal)
     goal = sweep.kept[number]
-    value = _sign(goal) * float(worst_entry(goal, jnp.array(point.rows[number][:2])))
+    value = _sign(goal) * goal.worst(point.rows[number][:2])
     return not point.feasible or not np.isfinite(value), value
 
 
@@ -197,15 +193,14 @@ def _sign(term: TermTable) -> float:
 def searcher(sweep: Sweep):
     """From the number of a point, its limits and where to start, to the point."""
     problem, kept, moving = sweep
-    stages = [make_stage(problem, index) for index in range(len(problem.study.stages))]
 
     def search(job):
         _, limits, values = job
         terms = _with_targets(kept, moving, limits)
         # A search that comes to no number spoils no other: its point is where it started.
         with contextlib.suppress(InputError):
-            values = run_stages(problem, stages, terms, values, log=Log())
-        return Point(values, rows_of(problem, terms, values), tuple(limits))
+            values = run_stages(problem, terms, values, log=Log())
+        return Point(values, problem.rows(terms, values), tuple(limits))
 
     return search
 
@@ -218,9 +213,7 @@ def _with_targets(kept, moving, limits) -> list[TermTable]:
 def _front(sweep: Sweep, points: list[Point]) -> Front:
     terms = [*sweep.kept, *sweep.moving]
     objectives = [next(term for term in sweep.kept if term.is_goal), *sweep.moving]
-    places = [terms.index(objective) for objective in objectives]
-    ends = [[jnp.array(point.rows[place][:2]) for place in places] for point in points]
-    values = np.array([[float(worst_entry(t, x)) for t, x in zip(objectives, row, strict=True)] for row in ends])
+    values = np.array([[term.worst(point.rows[terms.index(term)][:2]) for term in objectives] for point in points])
     signs = np.array([_sign(term) for term in objectives])
     feasible = np.array([point.feasible for point in points])
     best = np.zeros(len(points), bool)

@@ -1,59 +1,308 @@
-"""Search for a better microscope: by a study, or by a loss of your own.
+"""Searches of studies: stages of solvers that run one after the other, each on some of the free parameters.
 
-A study (`gs_jax.codesign.study`) has free parameters, terms with targets, and stages of solvers. The first stage may
-start from several points; the best goes on to the next stage. A log of all steps and the solver's state make a
-checkpoint. `optimize` takes any loss; studies are this with terms by name.
+A study (`gs_jax.codesign.study`) has free parameters, terms with targets, and stages. The first stage may start from
+several points; the best goes on to the next stage. `run_study` runs them once, `gs_jax.codesign.pareto` once for each
+combination of limits. A checkpoint has the log of all steps as one line of JSON, then the solver's state as arrays.
 """
 
 import contextlib
+import hashlib
+import io
+import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
-from ..base.arrays import host_code
-from ..base.errors import InputError, check_kind, errors_name_file, input_error, short_repr
+from ..base.arrays import as_float
+from ..base.errors import InputError, check_kind, errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..design.conversion import reduced_depth, reduced_sensor_distance, sample_table
 from ..design.design import Design, read_design
 from ..geometry import Imager
-from ..layers import check_room
-from ..optics.lens_types import interleave
+from ..io.files import atomic_write, check_input, decoding
+from ..objectives.conditions import Conditions
 from ..typing import PathLike
-from .parameters import Free, new_design, start_values
+from .parameters import Values, candidate, evaluated, new_design, start_values
 from .solve import (
-    CONVERGED,
-    LBFGSB,
     NOT_FINITE,
-    Bounds,
-    Box,
-    Log,
-    Solver,
+    Affine,
+    Sigmoid,
     State,
     Stepper,
-    least_change,
-    read_checkpoint,
+    Transforms,
+    forward,
+    inverse,
     run,
+    solver_of,
     warn_if_moved,
-    write_checkpoint,
 )
-from .stages import make_stage, problem_of, rows_of, run_stages, warn_of_start
-from .study import Study, read_study
-from .targets import Row
-from .traced import Traced
+from .study import Row, StageTable, Study, TermTable, check_design, initial_design, labels, read_study
+from .terms import TERMS, Objective, Term, evaluate, with_terms
 
 # Seconds between two checkpoints.
 _EVERY = 10.0
+_FORMAT = "gs-jax checkpoint 5"
+
+
+class Problem(NamedTuple):
+    """The imager of a design, the conditions of its evaluation, and the study."""
+
+    imager: Imager
+    at: Conditions
+    study: Study
+
+    def rows(self, terms: Sequence[TermTable], values: Values) -> list[Row]:
+        """Assess terms at parameters; random terms have one draw."""
+        functions = tuple(TERMS[term.name] for term in terms)
+        entries = _entries(self.imager, self.at, functions, values, jax.random.key(0))
+        return [term.assess(x) for term, x in zip(terms, entries, strict=True)]
+
+    def start(self, values: Values, number: int) -> Values:
+        """Random parameters within their bounds for each start, the given ones for 0; lens centres stay."""
+        if number == 0:
+            return values
+        rng = np.random.default_rng([self.study.seed, number])
+        free = {name: limits for name, limits in self.study.free.items() if name != "centers_mm"}
+        drawn = {name: rng.uniform(*limits, values[name].shape) for name, limits in free.items()}
+        return values | {name: jnp.asarray(x, values[name].dtype) for name, x in drawn.items()}
+
+
+def problem_of(design: Design, study: Study) -> Problem:
+    """The problem that a study poses for a design; raises `InputError` as `check_design`."""
+    check_design(design, study)
+    circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
+    where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
+    return Problem(*evaluated(design, **where, exposure=study.exposure, free=study.free), study)
+
+
+@eqx.filter_jit
+def _entries(
+    imager: Imager, at: Conditions, terms: tuple[Term, ...], values: Values, key: Key[Array, ""]
+) -> list[Float[Array, " entry"]]:
+    """Entries of terms at parameters."""
+    new = candidate(imager, at, values)
+    return [evaluate(term, *new, key) for term in terms]
+
+
+class Residuals(eqx.Module):
+    """Residuals of a study's terms as a function of a solver's variables; every number is a leaf.
+
+    `values`: parameters, of which those that have no transform stay.
+    """
+
+    imager: Imager
+    at: Conditions
+    values: Values
+    transforms: Transforms
+    objectives: tuple[Objective, ...]
+    margin: Float[Array, ""] = eqx.field(converter=as_float)
+
+    @eqx.filter_jit
+    def free(self, values: Values) -> Values:
+        """The solver's variables of parameters."""
+        return inverse(self.transforms, values)
+
+    @eqx.filter_jit
+    def parameters(self, free: Values) -> Values:
+        """All parameters, by the solver's variables."""
+        return self.values | forward(self.transforms, free)
+
+    def __call__(self, free: Values, key: Key[Array, ""]) -> Float[Array, " entry"]:
+        new = candidate(self.imager, self.at, self.parameters(free))
+        return jnp.concatenate([one.residual(*new, key, margin=self.margin) for one in self.objectives])
+
+
+class Stage(NamedTuple):
+    """A stage that is ready to run, the same programs for all starts, targets and values of fixed parameters.
+
+    `terms`: those that it looks at. `labels`: of these, for the log. `enough`: a cost at which all targets hold.
+    """
+
+    number: int
+    table: StageTable
+    terms: list[TermTable]
+    labels: list[str]
+    residuals: Residuals
+    stepper: Stepper
+    enough: float
+
+    @classmethod
+    def of(cls, problem: Problem, number: int, terms: Sequence[TermTable], values: Values) -> "Stage":
+        """A stage of a study, with the targets of its terms and the parameters that do not move."""
+        imager, at, study = problem
+        table = study.stages[number]
+        terms = [term for term in terms if table.terms is None or term.name in table.terms]
+        objectives = tuple(Objective(TERMS[term.name], term.kind, term.target, term.weight) for term in terms)
+        residuals = Residuals(imager, at, values, _transforms_of(study, number), objectives, study.margin)
+        key = jax.random.fold_in(jax.random.key(study.seed), number)
+        stepper = Stepper(residuals, solver_of(table), key)
+        return cls(number, table, terms, labels(terms, study), residuals, stepper, _enough(problem, terms, values))
+
+    def worst(self, free: Values) -> list[float]:
+        """The worst entry of each term."""
+        own = self.residuals
+        functions = tuple(one.term for one in own.objectives)
+        entries = _entries(own.imager, own.at, functions, own.parameters(free), self.stepper.key)
+        return [term.worst(x) for term, x in zip(self.terms, entries, strict=True)]
+
+    def begin(self, values: Values) -> State:
+        """The state at parameters."""
+        return self.stepper.begin(self.residuals.free(values))
+
+    def run(self, start: int, state: State, steps: list[dict[str, Any]], each: Callable[[State], None]):
+        """Run a start from its state, add a record for each step, and return that of its end."""
+
+        def after_step(state):
+            record = {"stage": self.number, "start": start, "step": int(state.step), "cost": float(state.cost)}
+            steps.append(record | dict(zip(self.labels, self.worst(state.free), strict=True)))
+            each(state)
+
+        state, reason = run(self.stepper, state, limit=self.table.steps, enough=self.enough, each=after_step)
+        reached = self.residuals.parameters(state.free)
+        worst = zip(self.terms, self.worst(state.free), strict=True)
+        return {
+            "stage": self.number,
+            "start": start,
+            "steps": int(state.step),
+            "cost": float(state.cost),
+            "met": all(term.assess([x]).met is not False for term, x in worst),
+            "reason": reason,
+            "free": {name: np.asarray(reached[name]).tolist() for name in state.free},
+        }
+
+
+def _transforms_of(study: Study, number: int) -> Transforms:
+    table = study.stages[number]
+    between = Affine if table.solver == "lbfgsb" else Sigmoid
+    return {name: between(*study.free[name]) for name in (study.free if table.free is None else table.free)}
+
+
+def warn_of_start(problem: Problem, values: Values) -> None:
+    """Warn of each parameter of a design that the first stage moves inside its bounds; `InputWarning`."""
+    warn_if_moved(_transforms_of(problem.study, 0), values)
+
+
+def _enough(problem: Problem, terms: Sequence[TermTable], values: Values) -> float:
+    """A cost at which all targets are met: one entry misses by half the margin. Zero if there is a goal."""
+    if any(term.is_goal for term in terms):
+        return 0.0
+    functions = tuple(TERMS[term.name] for term in terms)
+    sizes = eqx.filter_eval_shape(_entries, problem.imager, problem.at, functions, values, jax.random.key(0))
+    least = min(term.weight / math.sqrt(size.size) for term, size in zip(terms, sizes, strict=True))
+    return (least * problem.study.margin / 2) ** 2 / 2
+
+
+@dataclass
+class Log:
+    """Record of a search.
+
+    `steps`: one record a step, with the worst entry of each term. `ends`: one record for each finished start of a
+    stage, with the reason for stopping, whether all targets are met, and the values of the free parameters, in the
+    units that their names end in.
+    """
+
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    ends: list[dict[str, Any]] = field(default_factory=list)
+
+    def best_end(self, stage: int) -> dict[str, Any]:
+        """The record of the start with the least cost; one that misses a target only if all do.
+
+        Costs of Adam are random, but it has a single start unless it is the first stage.
+
+        Raises `InputError` if none reached a finite cost.
+        """
+        ends = [end for end in self.ends if end["stage"] == stage and end["reason"] != NOT_FINITE]
+        if not ends:
+            raise InputError(f"stage {stage + 1}: no start reached a finite cost; other bounds or terms are needed.")
+        return min(ends, key=lambda end: (not end["met"], end["cost"]))
+
+
+def run_stages(
+    problem: Problem,
+    terms: Sequence[TermTable],
+    values: Values,
+    *,
+    log: Log,
+    progress: Progress | None = None,
+    each: Callable[[State | None], None] = lambda state: None,
+    saved: tuple[Path, bytes] | None = None,
+    workers: Workers | None = None,
+) -> Values:
+    """Run stages one after the other and return the parameters; each starts from the result of the one before.
+
+    Parameters
+    ----------
+    terms
+        The study's, with the targets that count.
+    values
+        Initial parameters.
+    log
+        Steps and ends are added to it. A start that it has the end of is not run again.
+    each
+        Called after every step with the state; with None after every start that a worker ran.
+    saved
+        Saved state of the first start that has not ended.
+    workers
+        Processes that run the starts of the first stage, if there are several; this one by default.
+
+    Raises
+    ------
+    InputError
+        If no start of a stage reaches a finite cost.
+    """
+    progress = progress or Progress()
+    for number, table in enumerate(problem.study.stages):
+        ended = {end["start"] for end in log.ends if end["stage"] == number}
+        starts = [start for start in range(problem.study.starts if number == 0 else 1) if start not in ended]
+        with progress.counter(f"Stage {number + 1}, {table.solver}", len(starts)) as advance:
+            if workers and workers.remote and len(starts) > 1:
+                # A worker runs a start from its beginning, whatever was saved of it.
+                saved = None
+                log.steps[:] = [step for step in log.steps if step["start"] in ended]
+                build = with_terms(partial(_runner, problem, terms, values), [term.name for term in terms])
+                for _, result in workers.mapper(build)(starts):
+                    steps, end = result()
+                    log.steps.extend(steps)
+                    log.ends.append(end)
+                    each(None)
+                    advance()
+            else:
+                stage = Stage.of(problem, number, terms, values)
+                for start in starts:
+                    state = stage.begin(problem.start(values, start))
+                    if saved is not None:
+                        state, saved = restore_state(*saved, state), None
+                    log.ends.append(stage.run(start, state, log.steps, each))
+                    advance()
+        # Workers finish in any order.
+        for records in (log.steps, log.ends):
+            records.sort(key=lambda record: (record["stage"], record["start"]))
+        best = log.best_end(number)["free"]
+        values = values | {name: jnp.asarray(x, values[name].dtype) for name, x in best.items()}
+    return values
+
+
+def _runner(problem, terms, values):
+    """Build the function from a start of the first stage to the records of its steps and of its end."""
+    stage = Stage.of(problem, 0, terms, values)
+
+    def run_alone(start):
+        steps = []
+        end = stage.run(start, stage.begin(problem.start(values, start)), steps, lambda state: None)
+        return steps, end
+
+    return run_alone
 
 
 class Outcome(NamedTuple):
@@ -177,15 +426,13 @@ def _run_study(
     problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
     values = start_values(problem.imager, problem.at)
     warn_of_start(problem, values)
-    before = rows_of(problem, study.terms, values)
-    # Built when they are needed, so that compilation shows in the progress.
-    stages = (make_stage(problem, index) for index in range(len(study.stages)))
-    how = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
-    values = run_stages(problem, stages, study.terms, values, **how)
-    found = new_design(design, problem.imager, problem.at, values).model_copy(update={"name": study.name})
-    written = problem_of(found, study.model_copy(update={"depths_mm": None}))
-    after = rows_of(written, study.terms, start_values(written.imager, written.at))
-    return Outcome(design, study, found, before, after, log, time.monotonic() - began)
+    before = problem.rows(study.terms, values)
+    options = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
+    values = run_stages(problem, study.terms, values, **options)
+    new = new_design(design, problem.imager, problem.at, values).model_copy(update={"name": study.name})
+    written = problem_of(new, study.model_copy(update={"depths_mm": None}))
+    after = written.rows(study.terms, start_values(written.imager, written.at))
+    return Outcome(design, study, new, before, after, log, time.monotonic() - began)
 
 
 class _Saver:
@@ -201,170 +448,45 @@ class _Saver:
             self.last = time.monotonic()
 
 
-def initial_design(design: Design, study: Study) -> Design:
-    """Apply the sample, the orientation and the lens types of a study to a design.
+def write_checkpoint(path: PathLike, log: Log, study: Study, design: Design, state: State | None) -> None:
+    """Write a checkpoint atomically; the state is None between two starts."""
+    head = {"format": _FORMAT, "of": _digest(study, design), "log": asdict(log)}
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(json.dumps(head).encode() + b"\n")
+        eqx.tree_serialise_leaves(file, state)
 
-    Raises `InputError` if it has no such sample, or several and none is chosen, its depths are in front of that, its
-    lenses have another number of types, or are ideal thin lenses, which have no radii.
+
+def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, bytes]:
+    """Read the log, and the state for `restore_state`, empty between two starts.
+
+    Raises `InputError` if the file cannot be read, is not a checkpoint, or belongs to another study or design.
     """
-    table = sample_table(design, study.sample)
-    if study.sample is not None:
-        depths = study.depths_mm or design.imaging.working_distance_mm
-        design = design.replace(sample=table.model_dump(), working_distance_mm=depths)
-    if study.orientation is not None:
-        design = design.replace(orientation=study.orientation)
-    if study.kinds is None:
-        return design
-    found = design.imager().array.type_count
-    if found == study.kinds:
-        return design
-    if found > 1:
-        raise InputError(f"`kinds` must be {found}, as the design's lens types, or be left out, got {study.kinds}.")
-    if design.lens.focal_length_mm is not None:
-        raise InputError("`kinds` needs a design without `lens.focal_length_mm`.")
-    if study.kinds > (count := len(design.array.centers_mm)):
-        raise InputError(f"`kinds` must be at most {count}, the number of lenses, got {study.kinds}.")
-    radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.kinds)
-    which = interleave(np.array(design.array.centers_mm), study.kinds)
-    lens = design.lens.model_copy(update={"radius_of_curvature_mm": tuple(radius[which].tolist())})
-    return design.model_copy(update={"lens": lens})
-
-
-def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndarray:
-    """Focal lengths of thin lenses focused on equal parts of the depths, in vergence, relative to the middle's."""
-    near, far = study.depths_mm or design.imaging.working_distance_mm
-    ends = 1 / reduced_depth(design, near), 1 / reduced_depth(design, far)
-    share = (np.arange(types) + 0.5) / types
-    behind = 1 / reduced_sensor_distance(design, design.imaging.sensor_distance_mm)
-    return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
-
-
-class Optimum(NamedTuple):
-    """What `gs_jax.optimize` found.
-
-    `imager`: the best. `value`: its loss, of residuals half the sum of their squares. `result`: of
-    `optimistix.RESULTS`, whether the solver converged, ran out of steps, or came to what is not finite. `stats`:
-    `"num_steps"`, and `"values"`, the loss after each.
-    """
-
-    imager: Imager
-    value: Float[Array, ""]
-    result: optx.RESULTS
-    stats: dict[str, Any]
-
-
-@host_code()
-def optimize(
-    loss: Callable[[Imager], Float[Array, "..."]],
-    imager: Imager,
-    *,
-    free: Free,
-    solver: Solver | None = None,
-    bounds: Mapping[str, tuple[Any, Any]] = MappingProxyType({}),
-    steps: int = 256,
-    callback: Callable[[int, float, Imager], None] | None = None,
-) -> Optimum:
-    """Search for the imager of the least loss.
-
-    *Host.*
-
-    Parameters
-    ----------
-    loss
-        From an imager to one number, or to an array of residuals, half the sum of whose squares is minimised.
-        Traced and differentiated: `gs_jax.objectives` are made for it.
-    imager
-        To start from. Use double precision (`jax_enable_x64`): single stops far from the minimum.
-    free
-        What may change, of `gs_jax.free`.
-    solver
-        Of optimistix, a minimiser, or for residuals one of least squares; of optax; or
-        `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`. A search also ends
-        when the loss has changed by less than a millionth of itself over 20 steps; with a solver of optax, by less than
-        a billionth (1e-5 and 1e-6 in single precision).
-    bounds
-        Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
-        beyond it is moved inside, by 1 % of the range, with a warning.
-    steps
-        The most to take.
-    callback
-        Called after each step with its number, the loss and the imager.
-
-    Raises
-    ------
-    InputError
-        If an argument is of another kind, a bound is of what is not free or is not below the other, `LBFGSB` lacks a
-        bound, `loss` is one number and the solver is one of least squares, or layers have no room in the imager found.
-
-    Examples
-    --------
-    >>> import gs_jax as gs, jax.numpy as jnp
-    >>> scope = gs.geomscope().imager()
-    >>> loss = lambda scope: (scope.magnification(20.0) - 0.25) ** 2
-    >>> found = gs.optimize(loss, scope, free=gs.free("sensor_distance"), bounds={"sensor_distance": (4.0, 8.0)})
-    >>> print(round(float(found.imager.magnification(20.0)), 2))
-    0.25
-    """
-    solver = optx.BFGS(least_change(), least_change()) if solver is None else solver
-    _check(loss, imager, free, solver, steps)
-    maps = {
-        name: _map(name, free, bounds, isinstance(solver, LBFGSB)) for name in {**dict.fromkeys(free.names), **bounds}
-    }
-    values = free.values(imager)
-    start = {name: maps[name].free(value) for name, value in values.items()}
-    warn_if_moved(values, {name: maps[name].value(free) for name, free in start.items()})
-    key = jax.random.key(0)
-
-    def at(moved):
-        return free.replaced(imager, {name: maps[name].value(moved[name]) for name in free.names})
-
-    traced = Traced.of(lambda moved, given, key: loss(at(moved)), start, None, key)
-    if len(traced.dtypes) != 1 or not jnp.issubdtype(traced.dtypes[0], jnp.floating):
-        kinds = ", ".join(str(dtype) for dtype in traced.dtypes) or "nothing"
-        raise InputError(f"optimize: loss must return one number or array of floating point, got {kinds}.")
-    steps_of, losses = Stepper(traced, solver, key), []
-
-    def after(state):
-        losses.append(float(state.cost))
-        if callback is not None:
-            callback(int(state.step), losses[-1], at(state.free))
-
-    state, reason = run(steps_of, steps_of.begin(start, None), None, limit=steps, enough=-math.inf, each=after)
-    results = {CONVERGED: optx.RESULTS.successful, NOT_FINITE: optx.RESULTS.nonlinear_divergence}
-    result = results.get(reason, optx.RESULTS.nonlinear_max_steps_reached)
-    found = at(state.free)
+    head, _, state = check_input(path).read_bytes().partition(b"\n")
     try:
-        check_room(found.sensor_distance, found.filters, found.windows, found.sample, found.array.orientation)
-    except ValueError as error:
-        raise InputError(f"optimize: other bounds are needed: {error}") from error
-    return Optimum(found, state.cost, result, {"num_steps": int(state.step), "values": np.array(losses)})
+        found = json.loads(head)
+        if found["format"] != _FORMAT:
+            if str(found["format"]).startswith("gs-jax checkpoint"):
+                raise InputError(f"{path}: a checkpoint of another version, which cannot be resumed.")
+            raise ValueError
+        log, owner = Log(**found["log"]), found["of"]
+        if not isinstance(log.steps, list) or not isinstance(log.ends, list):
+            raise TypeError
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a checkpoint of `gs-jax optimize`.") from error
+    if owner != _digest(study, design):
+        raise InputError(f"{path}: the checkpoint is of another study or design, or of other --terms.")
+    return log, state
 
 
-def _check(loss, imager, free, solver, steps):
-    if not callable(loss):
-        raise input_error("loss", "a function of an imager", short_repr(loss))
-    check_kind("imager", imager, Imager, "an Imager, as `design.imager()` is")
-    check_kind("free", free, Free, "a Free, as `gs_jax.free` makes it")
-    check_kind("solver", solver, Solver, "a solver of optimistix or optax, or LBFGSB()")
-    check_kind("steps", steps, int | np.integer, "a whole number")
-    if steps < 1:
-        raise InputError(f"steps must be 1 or more, got {steps}.")
+def restore_state(path: Path, state: bytes, like: State) -> State:
+    """Restore the state of a checkpoint; `like` is a state of the same solver.
+
+    Raises `InputError` if the file is truncated.
+    """
+    with decoding(path, "checkpoint"):
+        return eqx.tree_deserialise_leaves(io.BytesIO(state), like)
 
 
-class _Unbounded:
-    """Values as they are."""
-
-    value = free = staticmethod(lambda x: x)
-
-
-def _map(name, free, bounds, box):
-    if name not in free.names:
-        raise InputError(f"bounds: names must be among the free ones, {', '.join(free.names)}, got {name}.")
-    if name not in bounds:
-        if box:
-            raise InputError(f"bounds: LBFGSB needs bounds of all that is free, got none of {name}.")
-        return _Unbounded
-    low, high = (np.asarray(end, float) for end in bounds[name])
-    if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
-        raise InputError(f"bounds of {name} must be finite, the lower one first, got {low} to {high}.")
-    return (Box if box else Bounds)(low, high)
+def _digest(study: Study, design: Design) -> str:
+    own = "".join(TERMS[term.name].source for term in study.terms)
+    return hashlib.sha256((study.model_dump_json() + design.model_dump_json() + own).encode()).hexdigest()

@@ -23,10 +23,8 @@ from ..pictures import PALETTE
 from ..typing import PathLike
 from .parameters import significant
 from .search import Outcome
-from .stages import best_end
-from .study import TermTable, labels
-from .targets import SIGNS, Row
-from .terms import TERMS, unit_of
+from .study import Row, TermTable, labels
+from .terms import SIGNS, TERMS, unit_of
 
 
 def before_and_after(outcome: Outcome) -> Table:
@@ -80,7 +78,7 @@ def write_outcome(
         "study": Path(source).name,
         "seed": study.seed,
         "date": datetime.date.today().isoformat(),
-        "reason": best_end(outcome.log, len(study.stages) - 1)["reason"],
+        "reason": outcome.log.best_end(len(study.stages) - 1)["reason"],
         "objectives": {record["term"]: record["after"] for record in records if None not in record["after"]},
     }
     write_design(paths[0], outcome.design.model_copy(update={"provenance": table}))
@@ -120,7 +118,7 @@ def picture(outcome: Outcome) -> Figure:
     layout, cost, terms = figure.subplots(1, 3, width_ratios=(1.3, 1, 1.5))
     _draw_layout(layout, outcome.design)
     asked = outcome.study.terms
-    best = lambda stage: best_end(outcome.log, stage)["start"]
+    best = lambda stage: outcome.log.best_end(stage)["start"]
     steps = [step for step in outcome.log.steps if step["start"] == best(step["stage"])]
     places = np.arange(1, len(steps) + 1)
     cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")

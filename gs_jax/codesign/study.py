@@ -4,7 +4,7 @@ design = "../geomscope.toml"            # to start from; `gs-jax optimize` takes
 name = "geomscope-optimized"
 depths_mm = [18.0, 23.0]
 confusion_um = 36.0
-kinds = 1                               # of lenses: 2 for two foci on one plate
+types = 1                               # of lenses: 2 for two foci on one plate
 sample = "water"                        # one of the design's [samples]; its [sample] by default
 
 [free]                                  # name = [lowest, highest]; see gs_jax.codesign.parameters
@@ -21,20 +21,25 @@ solver = "levenberg-marquardt"
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, ValidationError, model_validator
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from ..base.errors import InputError, short_repr
+from ..design.conversion import object_begins, reduced_depth, reduced_sensor_distance, sample_table
+from ..design.design import Design
 from ..io.toml import Table, one_line, read_toml
 from ..lenses import Orientation
+from ..optics.lens_types import interleave
 from ..typing import PathLike
 from .parameters import NAMES
-from .terms import check_term
+from .terms import GOALS, KINDS, check_term, current_name
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
-GOALS = ("minimise", "maximise")
-KINDS = ("at_most", "at_least", "equal", *GOALS)
+# Relative difference within which an equality holds.
+_LEAST_TOLERANCE = 1e-3
 
 # Lower limits of free parameters that are not lengths.
 _LOWER_LIMITS = {
@@ -46,7 +51,17 @@ _LOWER_LIMITS = {
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
+Entries = Sequence[float] | Float[Array | np.ndarray, " entry"]
+TermName = Annotated[str, AfterValidator(current_name)]
 Depths = Annotated[tuple[Positive, Positive], Field(strict=False, description="[near, far] in mm, near below far")]
+
+
+class Row(NamedTuple):
+    """Lowest and highest entry of a term, and whether it meets its target (None without one)."""
+
+    low: float
+    high: float
+    met: bool | None
 
 
 class TermTable(Table):
@@ -56,7 +71,7 @@ class TermTable(Table):
     as 1; the worst entry of a term counts.
     """
 
-    name: str = Field(description="the name of a term")
+    name: TermName = Field(description="the name of a term")
     at_most: Positive | None = Field(default=None, description="a positive number")
     at_least: Positive | None = Field(default=None, description="a positive number")
     equal: Positive | None = Field(default=None, description="a positive number")
@@ -87,6 +102,20 @@ class TermTable(Table):
         """Whether the term is minimised or maximised."""
         return self.kind in GOALS
 
+    def worst(self, entries: Entries) -> float:
+        """The entry farthest from the target."""
+        entries = np.asarray(entries)
+        if self.kind == "equal":
+            return float(entries[np.argmax(np.abs(entries - self.target))])
+        return float(entries.min() if self.kind in ("at_least", "maximise") else entries.max())
+
+    def assess(self, entries: Entries) -> Row:
+        """Compare the entries of the term with its target. An equality holds within 0.1 %."""
+        low, high, target = float(np.min(entries)), float(np.max(entries)), self.target
+        off = max(abs(low - target), abs(high - target)) / target
+        met = {"at_most": high <= target, "at_least": low >= target, "equal": off <= _LEAST_TOLERANCE}.get(self.kind)
+        return Row(low, high, met)
+
 
 class StageTable(Table):
     """`[[stages]]`: a solver for some of the parameters and terms, all by default. Stages run one after the other.
@@ -98,7 +127,7 @@ class StageTable(Table):
     steps: int = Field(default=200, ge=1, le=10**7, description="a whole number from 1 to 1e7")
     learning_rate: Positive = Field(default=0.03, description="a positive number")
     free: tuple[str, ...] | None = Field(default=None, strict=False, description="names of parameters in [free]")
-    terms: tuple[str, ...] | None = Field(default=None, strict=False, description="names of terms in [[terms]]")
+    terms: tuple[TermName, ...] | None = Field(default=None, strict=False, description="names of terms in [[terms]]")
 
 
 class LimitTable(Table):
@@ -107,7 +136,7 @@ class LimitTable(Table):
     It replaces the term of that name and kind, if there is one.
     """
 
-    name: str = Field(description="the name of a term")
+    name: TermName = Field(description="the name of a term")
     at_most: tuple[Positive, ...] | None = Field(default=None, strict=False, description="positive numbers")
     at_least: tuple[Positive, ...] | None = Field(default=None, strict=False, description="positive numbers")
 
@@ -135,8 +164,9 @@ class Study(Table):
     `exposure`: electrons that each mm^2 of clear aperture at 20 mm collects from an emitter of 40 um x 40 um, for terms
     that count light. `orientation`: side of the lenses toward the object, if it is not the design's. `sample`: of the
     design's `[samples]`, or "none", the one that holds the object; it becomes that of the new design, and must be given
-    if the design has several and no `[sample]`. `kinds`: number of lens types; lenses that are alike are divided into
-    so many types, with radii spread over the depths, and each type has its own radius, aperture and conic constant.
+    if the design has several and no `[sample]`. `types`: number of lens types (`kinds` in earlier versions, which is
+    still read); lenses that are alike are divided into so many types, with radii spread over the depths, and each type
+    has its own radius, aperture and conic constant.
     `starts`: number of starts of the first stage; all but the first are random within the bounds, and the best goes on.
     `seed`: of random numbers.
     """
@@ -145,7 +175,7 @@ class Study(Table):
     name: str = Field(default="optimized", description="a string")
     orientation: Orientation | None = Field(default=None, description='"plano" or "curved"')
     sample: str | None = Field(default=None, description='the name of one of the design\'s `[samples]`, or "none"')
-    kinds: int | None = Field(default=None, ge=1, description="a positive whole number")
+    types: int | None = Field(default=None, ge=1, description="a positive whole number")
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")
@@ -157,6 +187,13 @@ class Study(Table):
     terms: tuple[TermTable, ...] = Field(strict=False, min_length=1, description="one or more tables")
     stages: tuple[StageTable, ...] = Field(strict=False, min_length=1, description="one or more tables")
     pareto: tuple[LimitTable, ...] = Field(default=(), strict=False, max_length=2, description="one or two tables")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename_old_keys(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "kinds" in data and "types" not in data:
+            return {"types" if key == "kinds" else key: value for key, value in data.items()}
+        return data
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Study":
@@ -269,3 +306,71 @@ def _check_pareto(study: Study) -> None:
     goals = [term.name for term in study.terms if term.is_goal]
     if study.pareto and len(goals) != 1:
         raise ValueError(f"`terms`: exactly one must be minimised or maximised beside `pareto`, got {len(goals)}")
+
+
+def initial_design(design: Design, study: Study) -> Design:
+    """Apply the sample, the orientation and the lens types of a study to a design.
+
+    Raises `InputError` if it has no such sample, or several and none is chosen, its depths are in front of that, its
+    lenses have another number of types, or are ideal thin lenses, which have no radii.
+    """
+    table = sample_table(design, study.sample)
+    if study.sample is not None:
+        depths = study.depths_mm or design.imaging.working_distance_mm
+        design = design.replace(sample=table.model_dump(), working_distance_mm=depths)
+    if study.orientation is not None:
+        design = design.replace(orientation=study.orientation)
+    if study.types is None:
+        return design
+    found = design.imager().array.type_count
+    if found == study.types:
+        return design
+    if found > 1:
+        raise InputError(f"`types` must be {found}, as the design's lens types, or be left out, got {study.types}.")
+    if design.lens.focal_length_mm is not None:
+        raise InputError("`types` needs a design without `lens.focal_length_mm`.")
+    if study.types > (count := len(design.array.centers_mm)):
+        raise InputError(f"`types` must be at most {count}, the number of lenses, got {study.types}.")
+    radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.types)
+    which = interleave(np.array(design.array.centers_mm), study.types)
+    lens = design.lens.model_copy(update={"radius_of_curvature_mm": tuple(radius[which].tolist())})
+    return design.model_copy(update={"lens": lens})
+
+
+def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndarray:
+    """Focal lengths of thin lenses focused on equal parts of the depths, in vergence, relative to the middle's."""
+    near, far = study.depths_mm or design.imaging.working_distance_mm
+    ends = 1 / reduced_depth(design, near), 1 / reduced_depth(design, far)
+    share = (np.arange(types) + 0.5) / types
+    behind = 1 / reduced_sensor_distance(design, design.imaging.sensor_distance_mm)
+    return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
+
+
+def check_design(design: Design, study: Study) -> None:
+    """Raise `InputError` if a free parameter does not exist in the design, or depths may lie behind the plate."""
+    if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
+        raise InputError("`free.pitch_mm` needs a design of two lenses or more, got one lens.")
+    _check_room(design, study)
+    of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant", "aspheric_terms"} & set(study.free)
+    if design.lens.focal_length_mm is not None and of_lens:
+        raise InputError(f"`free.{min(of_lens)}` needs a design without `lens.focal_length_mm`.")
+
+
+def _check_room(design: Design, study: Study) -> None:
+    """Raise `InputError` if depths may come to lie before the object's medium, or the sensor within its windows."""
+    begins, (near, far) = object_begins(design), study.depths_mm or design.imaging.working_distance_mm
+    if near < begins:
+        raise InputError(
+            f"`depths_mm` must be {begins:g} mm or more, where the object's medium begins, got {near:g} mm."
+        )
+    twice = near + far - 2 * begins
+    if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
+        bounds, from_there = list(study.free["depth_span_mm"]), f" from {begins:g} mm on" if begins else ""
+        allowed = f"below {twice:g}, twice the middle of the depths{from_there}"
+        raise InputError(f"`free.depth_span_mm` must be {allowed}, got {bounds}.")
+    windows = sum(layer.thickness_mm for layer in design.layers.sensor)
+    if "sensor_distance_mm" in study.free and study.free["sensor_distance_mm"][0] < windows:
+        bounds = list(study.free["sensor_distance_mm"])
+        raise InputError(
+            f"`free.sensor_distance_mm` must be {windows:g} or more, as thick as the windows, got {bounds}."
+        )

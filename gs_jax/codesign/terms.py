@@ -1,8 +1,8 @@
 """Terms of a study: objectives by name, in the unit that the name ends in.
 
 A term's function takes an imager and its `Conditions` and gives a number or an array of them (over depths, lens types,
-lenses, points). Terms of your own are added by a package's entry point, by `add_terms`, or to `TERMS`; see `Term`. A
-study names terms, it never imports code.
+lenses, points). An `Objective` compares them with a target, for a solver. Terms of your own are added by a package's
+entry point, by `add_terms`, or to `TERMS`; see `Term`. A study names terms, it never imports code.
 """
 
 import difflib
@@ -14,12 +14,18 @@ from functools import partial
 from importlib.metadata import entry_points
 from typing import NamedTuple, TypeVar
 
-from jaxtyping import Array, Float
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
 
 from .. import objectives
+from ..base.arrays import as_float
 from ..base.errors import InputError, input_error, short_repr
+from ..geometry import Imager
 from ..io.files import check_input, check_suffix
-from ..typing import PathLike
+from ..objectives.conditions import Conditions
+from ..typing import PathLike, Real
 from .linear_error import volume_error
 
 Built = TypeVar("Built")
@@ -27,6 +33,14 @@ Built = TypeVar("Built")
 UM = 1000.0
 # The group of entry points that are terms.
 _GROUP = "gs_jax.terms"
+GOALS = ("minimise", "maximise")
+KINDS = ("at_most", "at_least", "equal", *GOALS)
+SIGNS = {"at_most": "<=", "at_least": ">=", "equal": "=", "minimise": "min", "maximise": "max"}
+# Exponent of the power mean that stands for the worst entry, and the largest logarithm of a ratio: e^50 does not
+# overflow in float32.
+_POWER, _LONGEST = 8, 50.0
+# Terms that earlier versions called otherwise, which are still read.
+_RENAMED = {"web_mm": "min_wall_mm"}
 # Terms of earlier versions, all of which judged reconstructions or the layout.
 _REMOVED = (
     "ghosts",
@@ -90,7 +104,7 @@ TERMS: dict[str, Term] = {
     "encircled_radius_um": Term("radius of 80 % of the rays, in the object", _scaled(UM, objectives.encircled_radius)),
     "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0]),
     "spacing_mm": Term("distance of nearest lenses", _of_imager(objectives.spacing)),
-    "web_mm": Term("mask left between neighbouring apertures", _of_imager(objectives.aperture_gap)),
+    "min_wall_mm": Term("mask left between neighbouring apertures", _of_imager(objectives.aperture_gap)),
     "hole_mm": Term("distance of a place on the plate from a lens", _of_imager(objectives.uncovered_distance)),
     "coverage": Term("share of the plate that is clear aperture", objectives.coverage),
     "sag_mm": Term("height of a whole lens", objectives.sag),
@@ -103,6 +117,11 @@ TERMS: dict[str, Term] = {
 _OURS = dict(TERMS)
 
 _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}
+
+
+def current_name(name: str) -> str:
+    """The name of a term that may be an earlier version's."""
+    return _RENAMED.get(name, name)
 
 
 def check_term(name: str) -> None:
@@ -158,3 +177,72 @@ def _built_with(build, terms):
 def unit_of(name: str) -> str:
     """The unit that a term's name ends in, as people write it; empty for a number without one."""
     return _UNITS.get(name.rpartition("_")[2], "")
+
+
+def evaluate(term: Term, imager: Imager, at: Conditions, key: Key[Array, ""]) -> Float[Array, " entry"]:
+    """Entries of a term, in its unit."""
+    entries = _entries(term, imager, at, key)
+    return jnp.exp(entries) if term.log else entries
+
+
+class Objective(eqx.Module):
+    """A term as a search sees it: its kind, `at_most` and so on, its target in the term's unit, and its weight."""
+
+    term: Term = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    target: Float[Array, ""] = eqx.field(converter=as_float)
+    weight: Float[Array, ""] = eqx.field(converter=as_float)
+
+    def residual(self, imager: Imager, at: Conditions, key: Key[Array, ""], *, margin: Real) -> Float[Array, " entry"]:
+        """Residual of a term, relative to its target: zero where a limit holds, so that its square is smooth.
+
+        `ln(1 + relu(x/t - (1 - margin)))` for at most, `relu(1 + margin - x/t)` for at least, `x/t - 1` for equal;
+        times the weight over the root of the number of entries. For a term that is a logarithm `ln(x/t)` takes the
+        place of `x/t - 1` in a limit. For a goal it is one entry, the mean of `(x/t)^8` (or `(t/x)^8`) to the power
+        1/8.
+
+        `margin`: fraction by which a limit is tightened.
+        """
+        ratio = self._ratio(_entries(self.term, imager, at, key))
+        missing = _missing(self.kind, ratio, jnp.asarray(margin, ratio.dtype))
+        return missing * (self.weight.astype(ratio.dtype) / math.sqrt(missing.size))
+
+    def _ratio(self, entries: Float[Array, " entry"]) -> Float[Array, " entry"]:
+        if not self.term.log:
+            return entries / self.target
+        logarithm = entries - jnp.log(self.target)
+        # A goal needs a positive ratio.
+        is_goal = self.kind in GOALS
+        return jnp.exp(jnp.clip(logarithm, -_LONGEST, _LONGEST)) if is_goal else 1 + logarithm
+
+
+def _missing(kind: str, ratio: Float[Array, " entry"], margin: Float[Array, ""]) -> Float[Array, " _"]:
+    match kind:
+        case "at_most":
+            return jnp.log1p(jax.nn.relu(ratio - (1 - margin)))
+        case "at_least":
+            return jax.nn.relu(1 + margin - ratio)
+        case "equal":
+            return ratio - 1
+        case "minimise":
+            return _power_mean(ratio)
+        case _:
+            positive = ratio > 0
+            return _power_mean(jnp.where(positive, 1 / jnp.where(positive, ratio, 1), 1e6))
+
+
+def _power_mean(x: Float[Array, " entry"]) -> Float[Array, "1"]:
+    """Power mean of non-negative numbers; zero, with zero slope, where all are zero."""
+    largest = jax.lax.stop_gradient(jnp.max(x))
+    largest = jnp.where(largest > 0, largest, 1)
+    mean = jnp.mean((x / largest) ** _POWER)
+    positive = mean > 0
+    return jnp.where(positive, largest * jnp.where(positive, mean, 1) ** (1 / _POWER), 0)[None]
+
+
+def _entries(term, imager, at, key):
+    entries = jnp.ravel(term.function(imager, at, key) if term.random else term.function(imager, at))
+    if not jnp.issubdtype(entries.dtype, jnp.floating):
+        # They have no slope: a search would stay where it begins.
+        raise input_error(f"a term ({term.meaning})", "of floating point", entries.dtype)
+    return entries

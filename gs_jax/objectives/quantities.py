@@ -31,30 +31,35 @@ from .conditions import (
 
 @by_type
 def f_number(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
-    """F-number of the clear aperture (below Eq. 8); one a type."""
-    return theory.f_number(imager.array.focal_length, clear_diameter(imager, depths))
+    """F-number `f / D` of the clear aperture (below Eq. 8); one a type."""
+    return imager.array.focal_length / clear_diameter(imager, depths)
 
 
 @by_type
 def numerical_aperture(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
-    """Numerical aperture of the clear aperture, on the sensor's side; one a type."""
-    return theory.numerical_aperture(imager.array.focal_length, clear_diameter(imager, depths))
+    """Numerical aperture `D / (2 f)` of the clear aperture, on the sensor's side; one a type.
+
+    The paper's "effective NA" of 0.13 takes the pitch for `D`.
+    """
+    return clear_diameter(imager, depths) / (2 * imager.array.focal_length)
 
 
 @by_type
 def lateral_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """Lateral resolution in focus, without aberrations (Eq. 5); a row a type."""
+    """Lateral resolution in focus, without aberrations, `max(lambda / (2 NA), d_p) / M` (Eqs. 4, 5); a row a type.
+
+    Its derivative jumps where the spot is as large as the pixel.
+    """
     at = as_conditions(imager, depths)
-    pixel, magnification = imager.sensor.pixel_pitch, imager.magnification(at.depths)
-    return theory.lateral_resolution(imager.wavelength, numerical_aperture(imager, at), pixel, magnification)
+    diffraction = imager.wavelength / (2 * numerical_aperture(imager, at))
+    return jnp.maximum(diffraction, imager.sensor.pixel_pitch) / imager.magnification(at.depths)
 
 
 @by_type
 def axial_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """Axial resolution in focus, without aberrations (Eq. 6); a row a type."""
+    """Axial resolution in focus, without aberrations, `r_xy z / sqrt(A_e / pi)` (Eq. 6); a row a type."""
     at = as_conditions(imager, depths)
-    along = imager.depth_in_medium(at.depths)
-    return theory.axial_resolution(lateral_resolution(imager, at), along, field_radius(imager, at))
+    return lateral_resolution(imager, at) * imager.depth_in_medium(at.depths) / field_radius(imager, at)
 
 
 @by_type
@@ -122,15 +127,14 @@ def sensor_blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 def blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Diameter of a thin lens's blur in the object; of the best type."""
     at = as_conditions(imager, depths)
-    reduced, v = imager.reduced_depth(at.depths), imager.reduced_sensor_distance
-    return theory.object_blur(imager.array.focal_length, clear_diameter(imager, at), reduced, v)
+    return sensor_blur(imager, at) / imager.magnification(at.depths)
 
 
 @whole_array
 def lenses_per_point(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
-    """Number of lenses that see a point, `N_e`: lenses on the plate over its area, times `A_e`."""
+    """Number of lenses that see a point, `N_e`: lenses on the plate over its area, times `A_e = pi r^2`."""
     at = as_conditions(imager, depths)
-    return theory.lenses_per_point(_count(imager, at), jnp.prod(finite_plate(imager)), field_radius(imager, at))
+    return jnp.pi * field_radius(imager, at) ** 2 * _count(imager, at) / jnp.prod(finite_plate(imager))
 
 
 def _count(imager, at):
@@ -140,9 +144,12 @@ def _count(imager, at):
 
 @whole_array
 def occupancy(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """Occupancy of the sensor, `V = N_e M^2` (Eq. 11), by all lenses."""
+    """Occupancy of the sensor, `V = N_e M^2` (Eq. 11), by all lenses.
+
+    The illuminated fraction of the sensor, for an object that fills the field.
+    """
     at = as_conditions(imager, depths)
-    return theory.occupancy(lenses_per_point(imager, at), imager.magnification(at.depths))
+    return imager.magnification(at.depths) ** 2 * lenses_per_point(imager, at)
 
 
 @partial(whole_array, aperture=True)
@@ -166,11 +173,17 @@ def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 @whole_array
 def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
-    """Width of the object that is imaged at all, along x and y."""
+    """Width of the object that at least one lens images onto the sensor, along x and y.
+
+    A lens at `c`, `|c| <= plate/2`, sees a point at `q` within the field radius r whose chief ray lands at
+    `|s c - M q| <= sensor/2`. The outermost such lens, at `c = min(plate/2, sensor/2 + M r)`, sees points up to `c +
+    r`.
+    """
     at, sensor, plate = as_conditions(imager, depths), imager.sensor, finite_plate(imager)
-    widths = jnp.array(sensor.shape[::-1], plate.dtype) * sensor.pixel_pitch
-    magnification = imager.magnification(at.depths)[:, None]
-    return theory.field_of_view(plate[None], widths[None], magnification, field_radius(imager, at))
+    half = jnp.array(sensor.shape[::-1], plate.dtype) * (sensor.pixel_pitch / 2)
+    radius = field_radius(imager, at)
+    reach = half[None] + imager.magnification(at.depths)[:, None] * radius
+    return 2 * (jnp.minimum(plate[None] / 2, reach) + radius)
 
 
 @whole_array

@@ -15,8 +15,7 @@ from ... import objectives
 from ...base.errors import InputError
 from ...codesign.parameters import candidate, depths_between, evaluated, start_values
 from ...codesign.study import Study
-from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
-from ...codesign.terms import TERMS
+from ...codesign.terms import SIGNS, TERMS, evaluate as evaluate_term
 from ...design.conversion import object_begins
 from ...design.datasheets import SIZES, circle_of_confusion_of, columns_of
 from ...design.design import Design
@@ -247,7 +246,7 @@ def find_violations(
         sentences.append(f"The aperture of {aperture:.3g} mm is wider than its sphere, which has {sphere:.3g} mm.")
     for table in () if study is None else study.terms:
         if table.name in evaluation.terms:
-            row = assess(table, evaluation.terms[table.name])
+            row = table.assess(evaluation.terms[table.name])
             if row.met is False:
                 span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (row.low, row.high)))
                 target = f"{SIGNS[table.kind]} {table.target:g}"
