@@ -26,7 +26,7 @@ from experiments.common import DESIGNS, Report, design_file, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
-from gs_jax.codesign.pareto import searcher, sweep_of
+from gs_jax.codesign.pareto import sweep_of
 from gs_jax.codesign.study import Study, initial_design, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.conversion import reduced_depth
@@ -89,14 +89,14 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
     """Results of a lens type, one record per share of the light."""
     design, study = posed(kind, span, steps)
     sweep = sweep_of(design, study)
-    search, judge = searcher(sweep), judge_of(design, study)
+    judge = judge_of(design, study)
     first, results = start_values(sweep.problem.imager, sweep.problem.at), []
     for number, light in enumerate(lights):
         limits = limits_of(light, span, design)
         start = results[-1]["values"] if results else first
         if followed:
             start = spread(followed[number]["values"], first)
-        point = search((number, limits, start))
+        point = sweep.search(limits, start)
         (between, width), searched = judge(point.values), decibels(point.rows[0].high)
         errors = {"error_db": together(searched, between), "searched_db": searched, "between_db": between}
         record = {"light_percent": light, "off_target": off_target(point, sweep, limits), "values": point.values}
@@ -113,11 +113,9 @@ def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, St
 
 def off_target(point, sweep, limits) -> float:
     """Relative violation of the worst target; up to a per cent counts as none."""
-    moved = (term.model_copy(update={term.kind: limit}) for term, limit in zip(sweep.moving, limits, strict=True))
-    pairs = zip([*sweep.kept, *moved], point.rows, strict=True)
     missed = [
         row.high / term.target - 1 if term.kind == "at_most" else 1 - row.low / term.target
-        for term, row in pairs
+        for term, row in zip(sweep.terms(limits), point.rows, strict=True)
         if not term.is_goal
     ]
     return max(0.0, *missed) if max(missed) > 0.01 else 0.0

@@ -20,7 +20,7 @@ from gs_jax.geometry import Imager
 from gs_jax.grid import Sensor
 from gs_jax.layouts import max_gap, nearest_neighbour_distances
 from gs_jax.objectives import Conditions
-from gs_jax.objectives.spot_sizes import _outermost_half
+from gs_jax.objectives.quantities import _outermost_half
 from gs_jax.optics.psf import diffraction_psf
 from gs_jax.optics.raytrace import to_numpy
 

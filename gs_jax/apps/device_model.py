@@ -39,7 +39,7 @@ from ..calibration.spot_model import (
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..objectives.conditions import Conditions, clear_diameter
-from ..objectives.spot_sizes import spot_width
+from ..objectives.quantities import spot_width
 from ..optics.diffraction import axial_strehl
 from ..optics.raytrace import to_numpy
 from ..optics.theory import FWHM

@@ -9,7 +9,7 @@ all designs found that keep its limits, so a looser limit never has a worse one.
 
 import contextlib
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -45,9 +45,10 @@ class Point(NamedTuple):
 
 
 class Front(NamedTuple):
-    """The terms with those that move last, the points, the objectives `(point, objective)` and which are not dominated.
+    """Result of a sweep.
 
-    Objectives are the goal and the limited terms, in the terms' units.
+    `terms`: those whose limits move last. `objectives`: the goal and these. `values`: of the objectives, in the terms'
+    units. `best`: which points no other one dominates.
     """
 
     terms: list[TermTable]
@@ -62,6 +63,74 @@ def non_dominated(losses: Float[np.ndarray, "point objective"]) -> Bool[np.ndarr
     no_worse = (losses[:, None] <= losses[None]).all(2)
     better = (losses[:, None] < losses[None]).any(2)
     return np.logical_not((no_worse & better).any(0))
+
+
+class Sweep(NamedTuple):
+    """The problem of a study whose limits move: its terms are those that stay and those that move, in this order."""
+
+    problem: Problem
+    kept: list[TermTable]
+    moving: list[TermTable]
+
+    def terms(self, limits: Sequence[float]) -> list[TermTable]:
+        """All terms, with these limits."""
+        moved = [t.model_copy(update={t.kind: limit}) for t, limit in zip(self.moving, limits, strict=True)]
+        return [*self.kept, *moved]
+
+    def search(self, limits: Sequence[float], values: Values) -> Point:
+        """The point of a search under limits, or that of its start if it comes to no number."""
+        terms = self.terms(limits)
+        with contextlib.suppress(InputError):
+            values = run_stages(self.problem, terms, values, log=Log())
+        return Point(values, self.problem.rows(terms, values), tuple(limits))
+
+    def under(self, point: Point, limits: tuple[float, ...]) -> Point:
+        """The design of a point, assessed under other limits."""
+        rows = [term.assess(row[:2]) for term, row in zip(self.terms(limits), point.rows, strict=True)]
+        return point._replace(rows=rows, limits=limits)
+
+    def losses(self, point: Point) -> list[float]:
+        """The goal and the terms whose limits move; less is better."""
+        pairs = zip((*self.kept, *self.moving), point.rows, strict=True)
+        worst = {term: _sign(term) * term.worst(row[:2]) for term, row in pairs}
+        return [worst[term] for term in self.objectives]
+
+    @property
+    def objectives(self) -> list[TermTable]:
+        return [next(term for term in self.kept if term.is_goal), *self.moving]
+
+    def rank(self, point: Point) -> tuple[bool, float]:
+        """Less is better: first whether a target is missed, then the goal."""
+        goal = self.losses(point)[0]
+        return not point.feasible or not np.isfinite(goal), goal
+
+    def is_better(self, new: Point, old: Point) -> bool:
+        """Whether a design meets targets that the other misses, or meets them and has a better goal by a millionth."""
+        (misses, goal), (missed, before) = self.rank(new), self.rank(old)
+        return not misses and (missed or goal < before - _LEAST_GAIN * abs(before))
+
+    def front(self, points: list[Point]) -> Front:
+        """Points, and which of them are on the front."""
+        losses = np.array([self.losses(point) for point in points])
+        feasible, best = np.array([point.feasible for point in points]), np.zeros(len(points), bool)
+        best[feasible] = non_dominated(losses[feasible])
+        values = losses * [_sign(term) for term in self.objectives]
+        return Front([*self.kept, *self.moving], self.objectives, points, values, best)
+
+
+def _sign(term: TermTable) -> float:
+    return -1.0 if term.kind in ("at_least", "maximise") else 1.0
+
+
+def sweep_of(design: Design, study: Study) -> Sweep:
+    """The sweep of a study for a design; `InputError` if it does not fit the design or moves no limit."""
+    if not study.pareto:
+        raise InputError("`pareto` must be one or two tables, got none.")
+    tables = [{"name": limit.name, limit.kind: limit.targets[0], "weight": 30.0} for limit in study.pareto]
+    moving, moved = list(map(TermTable.model_validate, tables)), [(limit.name, limit.kind) for limit in study.pareto]
+    kept = [term for term in study.terms if term.is_goal or (term.name, term.kind) not in moved]
+    wider = study.model_copy(update={"terms": (*kept, *moving)})
+    return Sweep(problem_of(design, wider), kept, moving)
 
 
 def trade_off(
@@ -100,35 +169,18 @@ def trade_off(
         return _trade_off(sweep_of(parent, question), each, progress or Progress(), workers or Workers())
 
 
-class Sweep(NamedTuple):
-    """The problem of a study whose limits move: its terms are those that stay and those that move, in this order."""
-
-    problem: Problem
-    kept: list[TermTable]
-    moving: list[TermTable]
-
-
-def sweep_of(design: Design, study: Study) -> Sweep:
-    """The sweep of a study for a design; `InputError` if it does not fit the design or moves no limit."""
-    if not study.pareto:
-        raise InputError("`pareto` must be one or two tables, got none.")
-    tables = [{"name": limit.name, limit.kind: limit.targets[0], "weight": 30.0} for limit in study.pareto]
-    moving, moved = list(map(TermTable.model_validate, tables)), [(limit.name, limit.kind) for limit in study.pareto]
-    kept = [term for term in study.terms if term.is_goal or (term.name, term.kind) not in moved]
-    wider = study.model_copy(update={"terms": (*kept, *moving)})
-    return Sweep(problem_of(design, wider), kept, moving)
-
-
 def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress, workers: Workers) -> Front:
-    problem, kept, moving = sweep
+    problem = sweep.problem
     combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
     neighbours = _neighbours(combinations)
-    build = with_terms(partial(searcher, sweep), [term.name for term in (*kept, *moving)])
-    stream, points = workers.mapper(build), {}
-    front = lambda: _front(sweep, [points[number] for number in sorted(points)])
+    names, points = [term.name for term in problem.study.terms], {}
+    stream = workers.mapper(with_terms(partial(_searcher, sweep), names))
+
+    def front() -> Front:
+        return sweep.front([points[number] for number in sorted(points)])
 
     def keep_better(number: int, new: Point) -> None:
-        if _is_better(sweep, new, points[number]):
+        if sweep.is_better(new, points[number]):
             points[number] = new
             each(front())
 
@@ -136,8 +188,8 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
         # The starts depend on the first round alone, so that the order in which workers finish does not matter.
         first = dict(points)
         for number, limits in enumerate(combinations):
-            if near := [_with_limits(sweep, first[other], limits) for other in neighbours[number]]:
-                yield number, limits, min(near, key=partial(_rank, sweep)).values
+            if near := [sweep.under(first[other], limits) for other in neighbours[number]]:
+                yield number, limits, min(near, key=sweep.rank).values
 
     with progress.counter("Trade-off", len(combinations) + sum(map(bool, neighbours))) as advance:
         values = start_values(problem.imager, problem.at)
@@ -153,72 +205,20 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
             keep_better(number, result())
             advance()
     for number, limits in enumerate(combinations):
-        designs = [_with_limits(sweep, point, limits) for point in points.values()]
-        keep_better(number, min(designs, key=partial(_rank, sweep)))
+        keep_better(number, min((sweep.under(point, limits) for point in points.values()), key=sweep.rank))
     return front()
 
 
+def _searcher(sweep: Sweep) -> Callable[[tuple[int, Sequence[float], Values]], Point]:
+    """From the number of a point, its limits and where to start, to the point; for a worker."""
+    return lambda job: sweep.search(*job[1:])
+
+
 def _neighbours(combinations: list[tuple[float, ...]]) -> list[list[int]]:
-    """Of each combination of limits those whose limits are next to its own along one axis."""
+    """For each combination of limits, those that are next to it along one axis."""
     axes = [sorted(set(axis)) for axis in zip(*combinations, strict=True)]
     index = np.array([[axis.index(limit) for axis, limit in zip(axes, some, strict=True)] for some in combinations])
     return [np.flatnonzero(np.abs(index - own).sum(1) == 1).tolist() for own in index]
-
-
-def _with_limits(sweep: Sweep, point: Point, limits: tuple[float, ...]) -> Point:
-    """The design of a point, assessed under other limits."""
-    terms = _with_targets(sweep.kept, sweep.moving, limits)
-    rows = [term.assess(row[:2]) for term, row in zip(terms, point.rows, strict=True)]
-    return Point(point.values, rows, limits)
-
-
-def _rank(sweep: Sweep, point: Point) -> tuple[bool, float]:
-    """Less is better: first whether a target is missed, then the goal."""
-    number = next(number for number, term in enumerate(sweep.kept) if term.is_goal)
-    goal = sweep.kept[number]
-    value = _sign(goal) * goal.worst(point.rows[number][:2])
-    return not point.feasible or not np.isfinite(value), value
-
-
-def _is_better(sweep: Sweep, new: Point, old: Point) -> bool:
-    """Whether a design meets targets that the other misses, or meets them too and has a better goal by a millionth."""
-    (misses, goal), (missed, before) = _rank(sweep, new), _rank(sweep, old)
-    return not misses and (missed or goal < before - _LEAST_GAIN * abs(before))
-
-
-def _sign(term: TermTable) -> float:
-    return -1.0 if term.kind in ("at_least", "maximise") else 1.0
-
-
-def searcher(sweep: Sweep):
-    """From the number of a point, its limits and where to start, to the point."""
-    problem, kept, moving = sweep
-
-    def search(job):
-        _, limits, values = job
-        terms = _with_targets(kept, moving, limits)
-        # A search that comes to no number spoils no other: its point is where it started.
-        with contextlib.suppress(InputError):
-            values = run_stages(problem, terms, values, log=Log())
-        return Point(values, problem.rows(terms, values), tuple(limits))
-
-    return search
-
-
-def _with_targets(kept, moving, limits) -> list[TermTable]:
-    moved = [term.model_copy(update={term.kind: limit}) for term, limit in zip(moving, limits, strict=True)]
-    return [*kept, *moved]
-
-
-def _front(sweep: Sweep, points: list[Point]) -> Front:
-    terms = [*sweep.kept, *sweep.moving]
-    objectives = [next(term for term in sweep.kept if term.is_goal), *sweep.moving]
-    values = np.array([[term.worst(point.rows[terms.index(term)][:2]) for term in objectives] for point in points])
-    signs = np.array([_sign(term) for term in objectives])
-    feasible = np.array([point.feasible for point in points])
-    best = np.zeros(len(points), bool)
-    best[feasible] = non_dominated((values * signs)[feasible])
-    return Front(terms, objectives, points, values, best)
 
 
 def as_json(front: Front) -> dict[str, Any]:

@@ -403,36 +403,23 @@ def run_study(
     6.0
     """
     with load(design, study) as (parent, question):
+        if workers and workers.remote and question.starts == 1:
+            raise InputError("--workers and --scheduler must be used with a study of several `starts`, got 1.")
+        began, log, saved = time.monotonic(), Log(), None
         path = None if checkpoint is None else Path(checkpoint)
-        return _run_study(parent, question, progress, path, resume, every, workers)
-
-
-def _run_study(
-    design: Design,
-    study: Study,
-    progress: Progress | None,
-    checkpoint: Path | None,
-    resume: bool,
-    every: float,
-    workers: Workers | None,
-) -> Outcome:
-    if workers and workers.remote and study.starts == 1:
-        raise InputError("--workers and --scheduler must be used with a study of several `starts`, got 1.")
-    began = time.monotonic()
-    log, saved = Log(), None
-    if resume and checkpoint:
-        log, state = read_checkpoint(checkpoint, study, design)
-        saved = (checkpoint, state) if state else None
-    problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
-    values = start_values(problem.imager, problem.at)
-    warn_of_start(problem, values)
-    before = problem.rows(study.terms, values)
-    options = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
-    values = run_stages(problem, study.terms, values, **options)
-    new = new_design(design, problem.imager, problem.at, values).model_copy(update={"name": study.name})
-    written = problem_of(new, study.model_copy(update={"depths_mm": None}))
-    after = written.rows(study.terms, start_values(written.imager, written.at))
-    return Outcome(design, study, new, before, after, log, time.monotonic() - began)
+        if resume and path:
+            log, state = read_checkpoint(path, question, parent)
+            saved = (path, state) if state else None
+        problem, save = problem_of(parent, question), _Saver(path, every, log, question, parent)
+        values = start_values(problem.imager, problem.at)
+        warn_of_start(problem, values)
+        before = problem.rows(question.terms, values)
+        options = {"log": log, "progress": progress, "each": save, "saved": saved, "workers": workers}
+        values = run_stages(problem, question.terms, values, **options)
+        new = new_design(parent, problem.imager, problem.at, values).model_copy(update={"name": question.name})
+        written = problem_of(new, question.model_copy(update={"depths_mm": None}))
+        after = written.rows(question.terms, start_values(written.imager, written.at))
+        return Outcome(parent, question, new, before, after, log, time.monotonic() - began)
 
 
 class _Saver:
