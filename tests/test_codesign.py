@@ -166,26 +166,21 @@ def test_lens_centres_can_be_free():
     assert np.abs(found.design.array.centers_mm).max() < 4
 
 
-def test_a_thin_lens_has_no_radius_to_free(table1):
-    thin = table1.model_copy(update={"lens": table1.lens.model_copy(update={"focal_length_mm": 4.65})})
-    with pytest.raises(InputError, match="free.radius_of_curvature_mm"):
-        run_study(thin, study())
-
-
-def test_a_single_lens(table1):
-    """It has no pitch: everything else can be free."""
+def test_what_cannot_be_free(table1):
+    """The pitch of a single lens, the radius of a thin one, depths behind the plate; everything else can be."""
     array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),), "size_mm": (2.0, 2.0)})
     single = table1.model_copy(update={"array": array})
     free = {"sensor_distance_mm": [2.0, 7.0]}
     found = run_study(single, study(free=free, terms=[TERMS[1]]))
-    with pytest.raises(InputError, match="free.pitch_mm.*one lens"):
-        run_study(single, study())
     assert found.after[0].met and found.design.array == array
-
-
-def test_depths_stay_before_the_plate(table1):
-    with pytest.raises(InputError, match=r"depth_span_mm.*below 41"):
-        run_study(table1, study(free={"depth_span_mm": [0.5, 60.0]}))
+    thin = table1.model_copy(update={"lens": table1.lens.model_copy(update={"focal_length_mm": 4.65})})
+    for design, free, words in (
+        (single, FREE, "free.pitch_mm.*one lens"),
+        (thin, FREE, "free.radius_of_curvature_mm"),
+        (table1, {"depth_span_mm": [0.5, 60.0]}, r"depth_span_mm.*below 41"),
+    ):
+        with pytest.raises(InputError, match=words):
+            run_study(design, study(free=free))
 
 
 def test_the_record_is_that_of_the_start_that_won():

@@ -85,13 +85,3 @@ def test_nothing_is_written_on_wrong_input(folder):
     with pytest.raises(InputError, match="`free.depth_span_mm` .*study.toml"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml")
     assert set(folder.iterdir()) == before
-
-
-@pytest.mark.integration
-def test_pareto(folder):
-    (folder / "study.toml").write_text(STUDY + '[[pareto]]\nname = "occupancy"\nat_least = [0.3, 0.5]\n')
-    result = run(pareto, "study.toml", "--out", "out")
-    assert result.exit_code == 0 and "2 of 2 points on the front" in result.output
-    points = json.loads((folder / "out" / "pareto.json").read_text())["points"]
-    assert points[0]["thickness_mm"] < points[1]["thickness_mm"]
-    assert (folder / "out" / "pareto.png").exists()

@@ -180,6 +180,7 @@ def test_the_command_reads_its_study_once_and_signs_its_numbers(tmp_path, monkey
     # The first line, or the one after a warning of the start, which a process prints once.
     lines = [line for line in done.output.splitlines() if not line.startswith("gs-jax: aperture_diameter_mm starts at")]
     assert len(read) == 1 and lines[0].startswith("depth_of_field_mm >=  light_percent")
+    assert "1 of 1 points on the front" in done.output and (tmp_path / "out" / "pareto.png").exists()
     found = read_provenance(tmp_path / "out" / "pareto.json")
     assert found["command"] == shlex.join(["gs-jax", *arguments]) and "[lens]" in found["design"]
     assert all(found[f"input {name}"].startswith("sha256 ") for name in ("study.toml", "start.toml"))

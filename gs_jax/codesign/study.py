@@ -241,7 +241,7 @@ def read_study(path: PathLike) -> Study:
     try:
         return Study.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{_in_a_list(error) or one_line(error, Study, {})} ({path}).") from error
+        raise InputError(f"{one_line(error, Study, {})} ({path}).") from error
 
 
 def parent_path(path: PathLike, study: Study) -> Path:
@@ -252,23 +252,6 @@ def parent_path(path: PathLike, study: Study) -> Path:
     if study.design is None:
         raise InputError(f"{path}: `design` must be the file of a design, relative to the study, got nothing.")
     return Path(path).parent / study.design
-
-
-def _in_a_list(error: ValidationError) -> str | None:
-    """The first problem in one line if it is in an array of tables, which `one_line` does not handle."""
-    problem = error.errors(include_url=False)[0]
-    name, number, *keys = problem["loc"] if len(problem["loc"]) > 1 else ("", "")
-    table = {"terms": TermTable, "stages": StageTable, "pareto": LimitTable}.get(str(name))
-    if table is None or not isinstance(number, int):
-        return None
-    where = f"`{name}` {number + 1}"
-    if not keys:
-        return f"{where}: {problem['msg'].removeprefix('Value error, ')}"
-    field = table.model_fields.get(str(keys[0]))
-    if field is None:
-        return f"{where}: keys must be among {', '.join(table.model_fields)}, got {short_repr(keys[0])}"
-    found = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
-    return f"{where}, {keys[0]} must be {field.description}, got {found}"
 
 
 def _check_free(study: Study) -> None:

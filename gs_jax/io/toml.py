@@ -52,8 +52,9 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
     lines = []
     for problem in problems[:3]:
         place = problem["loc"]
-        if not place:
-            lines.append(problem["msg"].removeprefix("Value error, "))
+        if not place or (problem["type"] == "value_error" and isinstance(place[-1], int)):  # of the whole table
+            where = f"`{_dotted(place)}`: " if place else ""
+            lines.append(where + problem["msg"].removeprefix("Value error, "))
         elif problem["type"] == "extra_forbidden":
             lines.append(f"`{_dotted(place)}`: no such key; {_nearest(place, model, _keys(model, also))}")
         else:
