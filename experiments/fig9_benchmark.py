@@ -45,10 +45,10 @@ from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.theory import FWHM
 from gs_jax.pictures import draw_image, label_of
+from gs_jax.reconstruction.networks import read_unrolled
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, reconstruct, voxel_grid
 from gs_jax.simulation.phantoms import letters, rasterize, snowflake
 from gs_jax.simulation.synthetic import Camera, expose
-from gs_jax.solvers.unrolled import read_unrolled
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")
 STEPS = 20

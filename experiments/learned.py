@@ -34,8 +34,8 @@ from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import pretrained
 from gs_jax.projection.forward_model import forward
+from gs_jax.reconstruction.networks import read_unrolled
 from gs_jax.reconstruction.pipeline import METHODS, Method
-from gs_jax.solvers.unrolled import read_unrolled
 
 # Different from the seed of the training.
 SEED = 1

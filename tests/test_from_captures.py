@@ -10,8 +10,9 @@ from gs_jax.apps.training.from_captures import FineTuned, _split, fine_tune
 from gs_jax.base.progress import Progress
 from gs_jax.cli.train import train_command
 from gs_jax.io.captures import write_capture
+from gs_jax.reconstruction.networks import read_unrolled, write_unrolled
 from gs_jax.reconstruction.radius_fit import RadiusFit, with_radii
-from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
+from gs_jax.solvers.unrolled import initialize_unrolled
 
 from .test_cli import DESIGN
 from .test_cross_validation import GRID, exposed, scope

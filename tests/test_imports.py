@@ -98,13 +98,13 @@ def imports_of(*folders: str) -> set[tuple[str, str]]:
 
 
 def test_the_physics_knows_no_files_and_solvers_no_microscope():
-    """As the design notes say; networks read their weights."""
+    """As the design notes say."""
     physics = imports_of("geometry", "lenses", "layers", "optics", "objectives", "projection")
     assert not {(module, other) for module, other in physics if other in ("io", "design", "simulation")}
     of_solvers = {
         (module, other) for module, other in imports_of("solvers") if other not in ("base", "typing", "solvers")
     }
-    assert of_solvers <= {("unrolled", "io")}
+    assert not of_solvers
 
 
 def test_jaxopt_has_one_place():

@@ -11,12 +11,12 @@ from click.testing import CliRunner
 import gs_jax as gs
 from gs_jax import Grid, InputError
 from gs_jax.__main__ import commands
+from gs_jax.base.weights import load_weights, save_weights
 from gs_jax.design.design import design_text
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.point_tables import read_points, write_points
 from gs_jax.io.provenance import DepthFrame, made_by, read_provenance, sidecar
 from gs_jax.io.volumes import read_volume, write_volume
-from gs_jax.io.weights import read_weights, write_weights
 from gs_jax.mold.export import Mesh, read_mesh, write_mesh
 from gs_jax.widget.layers import reader
 
@@ -34,7 +34,7 @@ WRITE = {
     "c.npy": lambda path, **o: write_capture(path, VOXELS[0], **o),
     "c.png": lambda path, **o: write_capture(path, np.ones((5, 4), np.uint16), **o),
     "p.csv": lambda path, **o: write_points(path, np.ones((2, 4)), **o),
-    "w.npz": lambda path, **o: write_weights(path, np.ones(3), {"n": 1}, **o),
+    "w.npz": lambda path, **o: save_weights(path, np.ones(3), {"n": 1}, **o),
     "m.3mf": lambda path, **o: write_mesh(path, TETRAHEDRON, "a <part>", **o),
 }
 
@@ -93,7 +93,7 @@ def test_points_that_are_found_have_nine_digits():
 def test_what_a_file_holds_is_the_same_with_it(tmp_path, name):
     path = tmp_path / name
     WRITE[name](path, provenance=ORIGIN)
-    read = {".npz": lambda path: read_weights(path, lambda n: np.zeros(3)), ".csv": read_points, ".zarr": read_volume}
+    read = {".npz": lambda path: load_weights(path, lambda n: np.zeros(3)), ".csv": read_points, ".zarr": read_volume}
     read |= {".npy": read_capture, ".png": read_capture}
     kind = read_volume if name.startswith("v") else read_mesh if name.startswith("m") else read_capture
     read.get(path.suffix, kind)(path)

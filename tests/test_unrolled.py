@@ -27,10 +27,11 @@ from gs_jax.apps.training.training_loop import (
 from gs_jax.base.progress import Progress
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.inverse_problem import InverseProblem, LensTypeGeometry
+from gs_jax.reconstruction.networks import read_unrolled, write_unrolled
 from gs_jax.reconstruction.residual import forward_residual
 from gs_jax.solvers import unrolled
 from gs_jax.solvers.richardson_lucy import bilinear_background
-from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
+from gs_jax.solvers.unrolled import initialize_unrolled
 
 KEY = jax.random.key(0)
 TINY = CaptureSpec(64, 0.06, 0.25, 3, binning=4)

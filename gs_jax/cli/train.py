@@ -109,7 +109,7 @@ def train_command(
     )
     from ..apps.training.training_slices import simulate_stacks
     from ..detection.unet import write_weights
-    from ..solvers.unrolled import write_unrolled
+    from ..reconstruction.networks import write_unrolled
 
     steps = steps or STEPS[network]
     checkpoint, history = checkpoint_path(output, resume=resume), side_file(output, ".json")
@@ -166,9 +166,10 @@ def _from_captures(
     from ..apps.training.from_captures import check_number, fine_tune
     from ..design.design import design_text, read_design, write_design
     from ..io.recordings import capture_files
+    from ..reconstruction.networks import read_unrolled, write_unrolled
     from ..reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
     from ..reconstruction.radius_fit import fit_radius
-    from ..solvers.unrolled import Unrolled, read_unrolled, write_unrolled
+    from ..solvers.unrolled import Unrolled
 
     if design is None or depths is None:
         raise InputError("--from-captures must be used with --design and --depths.")

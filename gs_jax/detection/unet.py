@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, short_repr
-from ..io import weights
+from ..base.weights import load_weights, save_weights, shipped_weights
+from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import Provenance
 from ..typing import PathLike, Volume
 from .background import mirror_indices
@@ -211,9 +212,10 @@ def _tiles(size: int, network: UNet) -> list[tuple[int, np.ndarray]]:
 
 
 def write_weights(path: PathLike, network: UNet, provenance: Provenance | None = None) -> None:
-    """Write a network as `.npz`; see `gs_jax.io.weights`."""
+    """Write a network as `.npz`; `InputError` as `check_output`."""
     about = {"offsets": network.offsets, "widths": network.widths, "standardized": network.standardized}
-    weights.write_weights(path, network, about, provenance)
+    with atomic_write(check_output(path, [".npz"])) as temporary:
+        save_weights(temporary, network, about, provenance)
 
 
 def read_weights(path: PathLike) -> UNet:
@@ -221,14 +223,15 @@ def read_weights(path: PathLike) -> UNet:
 
     Raises `InputError` if the file cannot be read, or does not hold the finite arrays of a network.
     """
-    return weights.read_weights(path, _skeleton)
+    with decoding(path := check_input(path), "file of weights (.npz)"):
+        return load_weights(path, _skeleton)
 
 
 def pretrained(name: str = "multislice") -> UNet:
     """A network that ships with the package, `"paper"` or `"multislice"` (ours); `InputError` for other names."""
     if name not in PRETRAINED:
         raise InputError(f"network must be one of {', '.join(PRETRAINED)}, got {short_repr(name)}.")
-    return weights.shipped(name, _skeleton)
+    return shipped_weights(name, _skeleton)
 
 
 def _skeleton(offsets: list[int], widths: list[int], standardized: bool) -> UNet:

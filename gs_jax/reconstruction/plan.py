@@ -15,8 +15,9 @@ from ..grid import Grid
 from ..optics.lens_types import blur_warning, sharpness
 from ..solvers.richardson_lucy import State as LucyState, restarted
 from ..solvers.surface import Surface
-from ..solvers.unrolled import Unrolled, read_unrolled
+from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
+from .networks import read_unrolled
 from .pipeline import METHODS, PIXELS_PER_VOXEL, STEPPED, Method, Reconstructor, voxel_grid
 from .residual import CrossValidation, ForwardResidual, cross_validated, forward_residual
 from .surface_fit import SurfaceFit, follow_sheets

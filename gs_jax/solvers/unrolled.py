@@ -17,9 +17,7 @@ from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 
 from ..base.arrays import divide
 from ..base.errors import InputError
-from ..io import weights
-from ..io.provenance import Provenance
-from ..typing import PathLike
+from ..base.weights import shipped_weights
 from .base import Operator, as_image, blurred, check_options, kept_pixels, norm
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
@@ -198,25 +196,10 @@ class Unrolled(eqx.Module):
     @staticmethod
     def pretrained() -> "Unrolled":
         """The networks that come with the package; the model card describes their training."""
-        return weights.shipped("unrolled", _skeleton)
+        return shipped_weights("unrolled", unrolled_skeleton)
 
 
-def write_unrolled(path: PathLike, networks: Unrolled, provenance: Provenance | None = None) -> None:
-    """Write the networks as `.npz`; see `gs_jax.io.weights`."""
-    width = networks.layers[0].bias.shape[-1]
-    about = {"first": networks.first, "networks": networks.power.size, "squares": networks.last, "width": width}
-    weights.write_weights(path, networks, about, provenance)
-
-
-def read_unrolled(path: PathLike) -> Unrolled:
-    """Read networks written by `write_unrolled`, in float32, without executing anything from the file.
-
-    Raises `InputError` if the file cannot be read, or does not hold finite arrays of such networks.
-    """
-    return weights.read_weights(path, _skeleton)
-
-
-def _skeleton(first: int, networks: int, width: int, squares: int | None = None, last: int = 0) -> Unrolled:
+def unrolled_skeleton(first: int, networks: int, width: int, squares: int | None = None, last: int = 0) -> Unrolled:
     """Shapes of the networks. The numbers are checked: they decide how much memory is allocated.
 
     Older files have `last` steps of Richardson-Lucy in place of conjugate gradients (`squares`).
