@@ -15,8 +15,7 @@ from gs_jax import read_capture, read_volume
 from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.io.camera import Correction, read_corrected
 from gs_jax.io.captures import Selection
-from gs_jax.io.plane_stacks import read_spots
-from gs_jax.io.recordings import open_recording
+from gs_jax.io.recordings import open_recording, read_spots
 from gs_jax.io.volumes import write_volume
 
 from .test_files import GRID, VOLUME

@@ -15,8 +15,7 @@ import pytest
 
 from gs_jax import Grid
 from gs_jax.io.point_tables import write_points
-from gs_jax.io.surfaces import write_surface
-from gs_jax.io.volumes import read_volume, write_volume
+from gs_jax.io.volumes import read_volume, write_surface, write_volume
 from gs_jax.reconstruction import pipeline
 
 from .test_cli import DESIGN, folder, run

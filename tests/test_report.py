@@ -22,8 +22,7 @@ from gs_jax.codesign import search_report
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
-from gs_jax.io.surfaces import write_surface
-from gs_jax.io.volumes import write_volume
+from gs_jax.io.volumes import write_surface, write_volume
 from gs_jax.layouts import plate_corners
 from gs_jax.optics.raytrace import trace_lenslet
 from gs_jax.pictures import downsample, make_slices

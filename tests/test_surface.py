@@ -12,7 +12,7 @@ import trimesh
 import gs_jax as gs
 from gs_jax.base.progress import Progress
 from gs_jax.io.provenance import read_provenance
-from gs_jax.io.surfaces import read_surface, write_surface
+from gs_jax.io.volumes import read_surface, write_surface
 from gs_jax.reconstruction.surface_fit import follow_sheets
 from gs_jax.solvers.surface import first_sheets, interpolated
 from gs_jax.widget.layers import reader

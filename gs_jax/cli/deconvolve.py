@@ -115,7 +115,8 @@ def deconvolve_command(
 
     from ..io.captures import write_capture
     from ..io.files import check_output
-    from ..io.plane_stacks import STACK_SUFFIXES, spot_names, write_planes
+    from ..io.recordings import spot_names
+    from ..io.volumes import STACK_SUFFIXES, write_planes
     from ..reconstruction.deconvolution import bin_pixels, filter_image, make_solver, pad_to_largest, run_deconvolution
     from ..reconstruction.field_fit import fit_field
 

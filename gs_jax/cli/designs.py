@@ -117,8 +117,8 @@ def info_command(file: Path | None, designs: bool):
         # The second line of a design describes its array.
         lines = {path.stem: repr(read_design(path)).splitlines()[1].strip() for path in shipped_designs()}
     elif file:
+        from ..io.captures import summarise
         from ..io.provenance import read_provenance
-        from ..io.summary import summarise
 
         lines = read_provenance(file) or summarise(file) | {"provenance": f"{file} has no provenance."}
     else:

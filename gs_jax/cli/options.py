@@ -262,7 +262,7 @@ class CaptureOptions:
         Single sharp pixels are kept. A colour capture and grey images of the point may be combined. Returns a list, as
         the planes may differ in size.
         """
-        from ..io.plane_stacks import read_spots
+        from ..io.recordings import read_spots
 
         spots = read_spots(paths, page=page, readout=self.readout, correction=self.correction)
         return [self._note(path, capture) for path, capture in spots]

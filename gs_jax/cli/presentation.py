@@ -43,8 +43,7 @@ def report_command(
     from ..design.design import design_text, read_design
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
-    from ..io.surfaces import read_surface
-    from ..io.volumes import read_volume
+    from ..io.volumes import read_surface, read_volume
 
     points, surface, capture, tolerance = (files[name] for name in ("points", "surface", "capture", "tolerance"))
     inputs = (design, volume, points, surface, capture, tolerance)

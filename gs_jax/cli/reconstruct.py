@@ -143,8 +143,7 @@ def reconstruct_command(
     from ..io.point_tables import write_points
     from ..io.provenance import INTENSITY, SCORE, DepthFrame
     from ..io.recordings import open_recording
-    from ..io.surfaces import SURFACE_SUFFIXES, write_surface
-    from ..io.volumes import VOLUME_SUFFIXES, write_volume
+    from ..io.volumes import SURFACE_SUFFIXES, VOLUME_SUFFIXES, write_surface, write_volume
     from ..projection.linear_map import compiled_for_cpu
     from ..reconstruction.plan import Plan
 

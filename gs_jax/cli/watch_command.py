@@ -56,8 +56,9 @@ def watch_folder(
     """Make a volume of each capture that comes, until an interrupt, and print a summary."""
     from ..io.captures import read_images
     from ..io.provenance import input_key
-    from ..io.recordings import Recording, WatchedFolder
+    from ..io.recordings import Recording
     from ..io.volume_series import VolumeSeries
+    from ..io.watched_folder import WatchedFolder
     from ..reconstruction.recording import reconstruct_live
 
     page = camera.page

@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError
 
 from ..base.errors import InputError, errors_name_file
 from ..io.files import write_text
-from ..io.lengths import PIXELS, in_mm, unit_of_name
+from ..io.names import PIXELS, in_mm, unit_of_name
 from ..io.point_tables import read_columns
 from ..io.provenance import Provenance, write_sidecar
 from ..io.toml import Table, one_line

@@ -1,14 +1,14 @@
 """Reads and writes captures: greyscale TIFF, PNG or .npy of uint8, uint16 or float32, or one page or colour of a file.
 
 Size and type are checked as the file declares them, before pixels are decoded. To add a format, add its suffix to
-`_FORMATS` with a function that reads it and one that writes it.
+`CAPTURE_SUFFIXES`, a function that reads it to `_READERS`, and how it is written to `write_capture`.
 """
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import tifffile
@@ -31,6 +31,7 @@ CHANNELS = ("red", "green", "blue")
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_PIXELS = 10**9
 DTYPES = ("uint8", "uint16", "float32")
+CAPTURE_SUFFIXES = (*TIFF_SUFFIXES, ".png", ".npy")
 # Pages that are chosen for files that go together: the one that a file has for itself, though it may be one of a set;
 # and all, if they are repeats of one image.
 OWN, REPEATS = "own", "repeats"
@@ -109,7 +110,7 @@ def average(images: Iterable[Shaped[np.ndarray, "row column"]]) -> Shaped[np.nda
 def read_images(path: PathLike, selection: Selection = Selection()) -> Images:
     """Yield the selected pages of a capture, of a mosaic with all of its pixels; errors as `read_capture`."""
     path = check_input(path)
-    read = _FORMATS[check_suffix(path, CAPTURE_SUFFIXES)].read
+    read = _READERS[check_suffix(path, CAPTURE_SUFFIXES)]
     if selection.bayer:
         mosaic_sites(selection.bayer, selection.channel)
     shape = selection.shape
@@ -182,14 +183,33 @@ def write_capture(
     pixels = np.asarray(image)
     if pixels.dtype.name not in DTYPES:
         raise ValueError(f"`image` must be one of {', '.join(DTYPES)}, got {pixels.dtype.name}.")
-    form = _FORMATS[path.suffix.lower()]
-    if pixels.dtype.name not in form.dtypes:
-        allowed = f"{', '.join(form.dtypes)} in {path.suffix} (use .tif or .npy)"
-        raise input_error("pixels", allowed, pixels.dtype.name, path)
+    suffix = path.suffix.lower()
+    if suffix == ".png" and pixels.dtype == np.float32:
+        raise input_error("pixels", "uint8, uint16 in .png (use .tif or .npy)", "float32", path)
+    if suffix == ".npy":
+        return write_npy(path, pixels, provenance)
+    table = {KEY: dict(provenance)} if provenance else {}
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        form.write(file, pixels, provenance)
-    if path.suffix.lower() == ".npy":
-        write_sidecar(path, provenance)
+        if suffix == ".png":
+            texts = PngInfo()
+            for key, value in table.items():
+                texts.add_itxt(key, json.dumps(value, ensure_ascii=False))
+            Image.fromarray(pixels).save(file, format="PNG", pnginfo=texts)
+        else:
+            tifffile.imwrite(file, pixels, photometric="minisblack", metadata=table)
+
+
+def write_npy(path: Path, pixels: np.ndarray, provenance: Provenance | None) -> None:
+    """Write an .npy, with its provenance beside it."""
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.save(file, pixels, allow_pickle=False)
+    write_sidecar(path, provenance)
+
+
+def open_npy(path: Path) -> np.ndarray:
+    """Map the numbers of an .npy; `InputError` if it has none."""
+    with decoding(path, ".npy of numbers"):
+        return np.lib.format.open_memmap(path, mode="r")
 
 
 def size_text(shape: tuple[int, ...]) -> str:
@@ -332,8 +352,7 @@ def _decode_png(path: Path, image: ImageFile.ImageFile, bits: int) -> np.ndarray
 
 
 def _read_npy(path: Path, selection: Selection) -> Iterator[np.ndarray]:
-    with decoding(path, ".npy of numbers"):
-        pixels = np.lib.format.open_memmap(path, mode="r")
+    pixels = open_npy(path)
     pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
     check_colour(path, None, selection)
     for index in _pages(path, len(pages), selection.page):
@@ -341,30 +360,51 @@ def _read_npy(path: Path, selection: Selection) -> Iterator[np.ndarray]:
         yield np.array(pages[index])
 
 
-def _write_tiff(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
-    tifffile.imwrite(file, pixels, photometric="minisblack", metadata={KEY: dict(provenance)} if provenance else {})
+_READERS = {**dict.fromkeys(TIFF_SUFFIXES, _read_tiff), ".png": _read_png, ".npy": _read_npy}
 
 
-def _write_png(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
-    texts = PngInfo()
-    if provenance:
-        texts.add_itxt(KEY, json.dumps(dict(provenance), ensure_ascii=False))
-    Image.fromarray(pixels).save(file, format="PNG", pnginfo=texts)
+def summarise(path: Path) -> dict[str, str]:
+    """Size, type, axes and use of a TIFF, a PNG or an .npy, from its header and its first page; empty for other files.
+
+    Raises `InputError` if the file cannot be read as what its suffix says.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in CAPTURE_SUFFIXES:
+        return {}
+    lines = _of_tiff(path) if suffix in TIFF_SUFFIXES else _of_npy(path) if suffix == ".npy" else {}
+    try:
+        image = next(read_images(path))
+        use = "a capture, or a PSF for `gs-jax deconvolve`"
+        lines = {"pixels": size_text(image.shape), "type": image.dtype.name} | lines
+    except InputError as error:
+        use = str(error).removeprefix(f"{path}: ").removesuffix(f" ({path}).").rstrip(".")
+        if int(lines.get("pages", "1")) > 1 and _is_stack(path):
+            use = f"a recording, a stack of PSFs for `gs-jax deconvolve`, or a capture ({use})"
+    return lines | {"use": use}
 
 
-def _write_npy(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
-    np.save(file, pixels, allow_pickle=False)
+def _is_stack(path):
+    """Whether the images of a file follow each other, as frames or as planes."""
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        return True
+    with open_tiff(path) as opened:
+        return stack_axis(opened.stack.axes, "tz") is not None
 
 
-class _Format(NamedTuple):
-    """How files of one suffix are read, page by page, and written, and the types that they hold."""
+def _of_tiff(path):
+    with open_tiff(path) as opened, decoding(path, "TIFF"), tifffile.TiffFile(path) as file:
+        series, page = file.series[0], opened.first
+        return {
+            "pixels": size_text(page.shape[:2] if page.planarconfig == 1 else page.shape[-2:]),
+            "type": str(page.dtype),
+            "pages": str(opened.count),
+            "axes": f"{series.axes}, {size_text(series.shape)}",
+            "colours": tifffile.PHOTOMETRIC(page.photometric).name.lower(),
+            "compression": tifffile.COMPRESSION(page.compression).name.lower(),
+        }
 
-    read: Callable[[Path, Selection], Iterator[np.ndarray]]
-    write: Callable[[BinaryIO, np.ndarray, Provenance | None], Any]
-    dtypes: tuple[str, ...] = DTYPES
 
-
-_TIFF = _Format(_read_tiff, _write_tiff)
-_PNG = _Format(_read_png, _write_png, ("uint8", "uint16"))
-_FORMATS = {**dict.fromkeys(TIFF_SUFFIXES, _TIFF), ".png": _PNG, ".npy": _Format(_read_npy, _write_npy)}
-CAPTURE_SUFFIXES = tuple(_FORMATS)
+def _of_npy(path):
+    pixels = open_npy(path)
+    pages = str(pixels.shape[0]) if pixels.ndim == 3 else "1"
+    return {"pixels": size_text(pixels.shape[-2:]), "type": pixels.dtype.name, "pages": pages}

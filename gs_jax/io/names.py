@@ -1,4 +1,4 @@
-"""Names of files as data: their natural order, gaps in numbered series, and names as text of any file format."""
+"""Names of files and columns as data: numbers, units of length, gaps in series, and text for any file format."""
 
 import math
 import re
@@ -7,15 +7,40 @@ from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 from typing import NamedTuple, TypeVar
 
-from .lengths import mm_per
+from ..base.errors import InputError
 
 Name = TypeVar("Name", bound=str | PurePath)
 
 # A unit after a number. Lengths alone: other units are compared by their letters.
-_UNIT = re.compile(r"([nmcuµμ]m)(?![a-z])", re.IGNORECASE)
+_UNIT_AFTER = re.compile(r"([nmcuµμ]m)(?![a-z])", re.IGNORECASE)
 _SIGNS = {"-": -1, "−": -1, "+": 1}
 # Characters that XML 1.0 cannot hold, and bytes of a name that are not UTF-8, which Python reads as surrogates.
 _NOT_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]")
+
+
+# Millimetres of a unit, and its spellings: symbols as in OME, words as in NGFF, and what people write.
+_UNITS = {
+    "nm": (1e-6, "nm nanometer nanometers nanometre nanometres"),
+    "um": (1e-3, "um µm μm micron microns micrometer micrometers micrometre micrometres"),
+    "mm": (1.0, "mm millimeter millimeters millimetre millimetres"),
+    "cm": (10.0, "cm centimeter centimeters centimetre centimetres"),
+    "dm": (100.0, "dm decimeter decimetre"),
+    "m": (1000.0, "m meter meters metre metres"),
+    "in": (25.4, 'in inch inches "'),
+    "ft": (304.8, "ft foot feet"),
+    "mil": (0.0254, "mil mils thou"),
+}
+_SPELLINGS = {spelling: unit for unit, (_, spellings) in _UNITS.items() for spelling in spellings.split()}
+PIXELS = "px"
+_SPELLINGS |= dict.fromkeys(("px", "pix", "pixel", "pixels"), PIXELS)
+# Words of headers, too, which are units at the end of a name alone.
+_ALSO_WORDS = ("m", "in")
+# What follows the letter of an axis without being a unit.
+_NO_UNITS = frozenset(
+    "abs absolute axis c center centers centre centres col column coord coordinate coordinates data design fit "
+    "found lens loc location mean measured new nominal of p pos position positions raw ref rel relative row true value "
+    "x y z".split()
+)
 
 
 def plain_text(text: str) -> str:
@@ -53,7 +78,7 @@ def natural_order(names: Iterable[Name]) -> list[Name]:
         texts.add(piece.before)
         if piece.decimals:
             decimals[piece.before].add(piece.decimals)
-        if unit := _UNIT.match(piece.after):
+        if unit := _UNIT_AFTER.match(piece.after):
             units.add(unit[1].lower())
     counted = {before for before, digits in decimals.items() if not _are_decimals(digits)}
     keys = [
@@ -91,7 +116,7 @@ def _key(piece: _Piece, texts: set[str], counted: set[str], has_units: bool) -> 
     can_be = before[-1:] in _SIGNS if before[:-1] else piece.is_first and before in _SIGNS
     if can_be and (not before[-2:-1].isalnum() or before[:-1] in texts):
         before, sign = before[:-1], _SIGNS[before[-1]]
-    unit = _UNIT.match(piece.after) if has_units else None
+    unit = _UNIT_AFTER.match(piece.after) if has_units else None
     scale = sign * (mm_per(unit[1].lower()) if unit else 1)
     if piece.decimals and piece.before in counted:
         return [before, scale * int(piece.whole), ".", int(piece.decimals)]
@@ -114,3 +139,41 @@ def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
     # Times in names differ a little from step to step.
     gap = next((place for place, step in enumerate(steps) if step >= 1.75 * min(steps)), None)
     return None if gap is None or min(steps) < 1 else (names[gap], names[gap + 1])
+
+
+def mm_per(spelling: str) -> float:
+    """Millimetres of a unit; `KeyError` if it is none of length."""
+    return _UNITS[_SPELLINGS[spelling]][0]
+
+
+def in_mm(numbers, unit: str):
+    """Numbers of a unit in mm. Where it is a decimal part of a mm, a division is exact to the last digit."""
+    factor = _UNITS[unit][0]
+    return numbers / round(1 / factor) if unit in ("nm", "um") else numbers * factor
+
+
+def unit_of_name(name: str) -> str | None:
+    """The unit that a column's name ends in, or has in brackets, as one of `nm`, `um`, ..., or `PIXELS`; or None.
+
+    Raises `InputError` if the unit in brackets, or the word after the letter of an axis, is not known.
+    """
+    lower = name.lower()
+    for inside in re.findall(r"[(\[](.*?)[)\]]", lower):
+        inner = [word for word in re.findall(r"[^\W\d_]+|\"", inside) if word not in _NO_UNITS]
+        if inner and inner[-1] in _SPELLINGS:
+            return _SPELLINGS[inner[-1]]
+        if inner:
+            raise _unknown(name, inside.strip())
+    words = re.findall(r"[^\W\d_]+|\"", lower)
+    if words and words[-1] in _SPELLINGS:
+        return _SPELLINGS[words[-1]]
+    if known := [word for word in words if word in _SPELLINGS and word not in _ALSO_WORDS]:
+        return _SPELLINGS[known[-1]]
+    if len(words) == 2 and words[0] in ("x", "y", "z") and words[1] not in _NO_UNITS:
+        raise _unknown(name, words[1])
+    return None
+
+
+def _unknown(name: str, unit: str) -> InputError:
+    units = ", ".join((*_UNITS, PIXELS))
+    return InputError(f"column {name!r:.40} must be in {units}, or say nothing, got {unit!r:.40}.")

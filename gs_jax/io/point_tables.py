@@ -3,11 +3,12 @@
 import contextlib
 import csv
 import io
+import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int, Shaped
@@ -15,14 +16,14 @@ from jaxtyping import Float64, Int, Shaped
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike, Points
-from .files import MAX_TEXT_BYTES, atomic_write, check_input, check_output, read_text, write_text
+from .files import MAX_TEXT_BYTES, atomic_write, check_output, read_text
 from .provenance import SURFACE, Provenance, write_sidecar
 
 POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
 MAX_POINTS, MAX_SOURCES = 1_000_000, 10_000
 _POSITION, _CAPTURE = ("x_mm", "y_mm", "z_mm"), "capture"
-# Longest first line in bytes; bytes of a float64 with all its digits and a separator; characters of plain numbers.
-_MAX_HEADER, _NUMBER_BYTES, _PLAIN = 1000, 32, b"0123456789+-.eE, \t\r\n"
+# Longest line of numbers in bytes: ten float64 with all their digits. Characters of plain numbers.
+_LINE_BYTES, _PLAIN = 320, b"0123456789+-.eE, \t\r\n"
 # A semicolon or a tab between values leaves the comma for decimals, as many European spreadsheets write them.
 _SEPARATORS = ";\t,"
 # Names of the columns x and y: the letter, alone or with words of place about it, or the terms of images.
@@ -63,14 +64,9 @@ def read_scene_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
 
 def _read_points(path: PathLike) -> tuple[Float64[np.ndarray, "point 4"], dict[str, Float64[np.ndarray, " point"]]]:
     """Points with depths from the array, and further columns by name."""
-    with check_input(path).open("rb") as file:
-        first = file.readline(_MAX_HEADER).decode("utf-8-sig", "replace").rstrip("\r\n")
-    names = [name.strip(' "') for name in first.split(_separator(first))]
-    names = names if names[:4] == POINTS_HEADER.split(",") else POINTS_HEADER.split(",")
-    table = read_table(path, ",".join(names), MAX_POINTS)
-    points = np.ascontiguousarray(table[:, :4])
-    if SURFACE in names:
-        points[:, 2] += table[:, names.index(SURFACE)]
+    names, table = read_table(path, POINTS_HEADER, MAX_POINTS)
+    points, more = np.ascontiguousarray(table[:, :4]), dict(zip(names[4:], table[:, 4:].T, strict=True))
+    points[:, 2] += more.get(SURFACE, 0.0)
     for column, name, wrong, allowed in (
         (2, "z_mm", points[:, 2] <= 0, "above 0"),
         (3, "intensity", points[:, 3] < 0, "0 or more"),
@@ -78,7 +74,7 @@ def _read_points(path: PathLike) -> tuple[Float64[np.ndarray, "point 4"], dict[s
         if wrong.any():
             row = int(np.argmax(wrong))
             raise input_error(f"point {row + 1}, {name}", allowed, float(points[row, column]), path)
-    return points, dict(zip(names[4:], table[:, 4:].T, strict=True))
+    return points, more
 
 
 @host_code()
@@ -116,13 +112,8 @@ def write_points(
     x_mm,y_mm,z_mm,intensity
     0.5,-0.4,19.5,1.0
     """
-    rows, more = np.asarray(points), more or {}
-    # `str` of NumPy's scalars has the shortest digits that read back as the same float32 or float64.
-    further = zip(*more.values(), strict=True) if more else [()] * len(rows)
-    lines = [",".join([POINTS_HEADER, *more])]
-    lines += [",".join(str(value) for value in (*row, *others)) for row, others in zip(rows, further, strict=True)]
-    write_text(path, "\n".join(lines) + "\n", [".csv"])
-    write_sidecar(path, provenance)
+    columns = [*np.asarray(points).T, *(more or {}).values()]
+    write_rows(path, [POINTS_HEADER, *(more or {})], zip(*columns, strict=True), provenance)
 
 
 def write_points_in_time(
@@ -133,16 +124,26 @@ def write_points_in_time(
     `frames` are their numbers and the columns of their points by name, in all the same, the first four as in
     `read_points`; one frame is held at a time. `InputError` as `check_output`.
     """
-    path, names = check_output(path, [".csv"]), None
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        for frame, columns in frames:
-            if names is None:
-                names = list(columns)
-                file.write(",".join([POINTS_HEADER, "frame", *names[4:]]) + "\n")
-            for row in zip(*columns.values(), strict=True):
-                file.write(",".join(map(str, (*row[:4], frame, *row[4:]))) + "\n")
-        if names is None:
-            file.write(f"{POINTS_HEADER},frame\n")
+    frames = iter(frames)
+    first = list(itertools.islice(frames, 1))
+    rows = (
+        (*row[:4], frame, *row[4:])
+        for frame, columns in itertools.chain(first, frames)
+        for row in zip(*columns.values(), strict=True)
+    )
+    names = list(first[0][1])[4:] if first else []
+    write_rows(path, [POINTS_HEADER, "frame", *names], rows, provenance)
+
+
+def write_rows(path: PathLike, names: Iterable[str], rows: Iterable[Iterable[Any]], provenance: Provenance | None):
+    """Write a CSV file of these columns row by row, and its provenance beside it; `InputError` as `check_output`."""
+    with (
+        atomic_write(check_output(path, [".csv"])) as temporary,
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
+        file.write(",".join(names) + "\n")
+        # `str` of NumPy's scalars has the shortest digits that read back as the same float32 or float64.
+        file.writelines(",".join(map(str, row)) + "\n" for row in rows)
     write_sidecar(path, provenance)
 
 
@@ -158,78 +159,62 @@ def read_positions(
     Raises `InputError` if the file cannot be read, the header has other columns, or a cell is neither empty nor
     allowed.
     """
-    text = read_text(path)
-    separator = _separator(text.partition("\n")[0])
-    lines = csv.DictReader(
-        io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, restkey="", restval=""
-    )
-    names = [name.strip() for name in lines.fieldnames or []]
+    table = _open_table(path, read_text(path))
+    _, names = next(table.rows, ("", []))
     if not names or set(names) - {*_POSITION, _CAPTURE} or len(set(names)) < len(names):
         raise input_error("header", f"some of {_CAPTURE},{','.join(_POSITION)}", short_repr(",".join(names)), path)
-    lines.fieldnames = names
     points, sources = [], []
-    for line in lines:
-        place = f"line {lines.line_num}"
-        if "" in line:
-            raise input_error(place, f"{','.join(names)}", "more values", path)
-        cells = [(name, _decimal((line.get(name) or "").strip(), separator)) for name in _POSITION]
+    for line, cells in table.rows:
+        if len(cells) > len(names):
+            raise input_error(line, f"{','.join(names)}", "more values", path)
+        row = dict(zip(names, cells, strict=False))
         allowed = "a number of mm, or nothing if it is not known"
-        points.append([_number(path, f"{place}, {name}", cell, allowed) if cell else math.nan for name, cell in cells])
-        capture = len(sources)
-        sources.append(_capture(path, place, line[_CAPTURE].strip(), captures) if _CAPTURE in names else capture)
+        point = [(name, row.get(name)) for name in _POSITION]
+        points.append([table.number(f"{line}, {name}", cell, allowed) if cell else math.nan for name, cell in point])
+        capture = row.get(_CAPTURE, "")
+        sources.append(_capture(path, line, capture, captures) if _CAPTURE in names else len(sources))
         if len(sources) > MAX_SOURCES:
             raise input_error("table", f"at most {MAX_SOURCES} lines", "more", path)
     return np.array(points, float).reshape(-1, 3), np.array(sources, int)
 
 
-def _capture(path: PathLike, place: str, cell: str, captures: Sequence[PathLike]) -> int:
+def _capture(path: PathLike, line: str, cell: str, captures: Sequence[PathLike]) -> int:
     names = [PurePath(capture).name for capture in captures]
     if cell in names:
         return names.index(cell)
     if cell.isdecimal() and 1 <= int(cell) <= len(names):
         return int(cell) - 1
     allowed = f"a number from 1 to {len(names)} or the name of a capture"
-    raise input_error(f"{place}, {_CAPTURE}", allowed, short_repr(cell), path)
+    raise input_error(f"{line}, {_CAPTURE}", allowed, short_repr(cell), path)
 
 
-def read_table(path: PathLike, header: str, max_rows: int) -> Float64[np.ndarray, "row column"]:
-    """Read the numbers of a CSV file whose first line is `header`; without rows the shape is `(0, column)`.
+def read_table(path: PathLike, header: str, max_rows: int) -> tuple[list[str], Float64[np.ndarray, "row column"]]:
+    """Read the numbers of a CSV file whose first columns are those of `header`, and the names of all columns.
 
     A semicolon or a tab in the first line separates values, in place of commas, which are then decimal ones.
 
     Raises `InputError` if it cannot be read, has another header, a line with too many or too few values, a value that
     is not a finite number, or more than `max_rows` rows.
     """
-    names = header.split(",")
-    text = read_text(path, max(MAX_TEXT_BYTES, max_rows * len(names) * _NUMBER_BYTES))
-    if (table := _plain_table(text, header, max_rows)) is not None:
-        return table
-    separator = _separator(text.partition("\n")[0])
-    lines = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-    numbers = []
-    try:
-        first = next(lines, [])
-        if (first if separator == "," else [name.strip() for name in first]) != names:
-            raise input_error("header", header, short_repr(",".join(first)), path)
-        for line in lines:
-            if line:
-                numbers.append(
-                    _numbers(path, f"line {lines.line_num}", names, [_decimal(cell, separator) for cell in line])
-                )
-            if len(numbers) > max_rows:
-                raise input_error("table", f"at most {max_rows} rows below {header}", "more", path)
-    except csv.Error as error:
-        raise InputError(f"{path}: line {lines.line_num} is not CSV below the header {header}: {error}.") from error
-    return np.array(numbers, dtype=float).reshape(-1, len(names))
+    text = read_text(path, max(MAX_TEXT_BYTES, max_rows * _LINE_BYTES))
+    table, expected = _open_table(path, text), header.split(",")
+    _, names = next(table.rows, ("", []))
+    if names[: len(expected)] != expected:
+        raise input_error("header", header, short_repr(",".join(names)), path)
+    if (plain := _plain_numbers(text, len(names))) is not None and len(plain) <= max_rows:
+        return names, plain
+    rows = [table.numbers(line, names, cells) for line, cells in itertools.islice(table.rows, max_rows + 1)]
+    if len(rows) > max_rows:
+        raise input_error("table", f"at most {max_rows} rows below {header}", "more", path)
+    return names, np.array(rows, dtype=float).reshape(-1, len(names))
 
 
-def _plain_table(text: str, header: str, max_rows: int) -> np.ndarray | None:
-    """Read a table of plain numbers fast; None if it has anything else, or an error for `read_table` to describe."""
+def _plain_numbers(text: str, columns: int) -> np.ndarray | None:
+    """Read plain numbers below a header fast; None if there is anything else, or a fault for `read_table` to name."""
     first, _, body = text.partition("\n")
-    if first.rstrip("\r") != header or not body.strip() or body.encode().translate(None, _PLAIN):
+    if "\r" in first.rstrip("\r") or not body.strip() or body.encode().translate(None, _PLAIN):
         return None
-    table = _load_numbers(io.StringIO(body, newline=""), ",", header.count(",") + 1)
-    return table if table is not None and len(table) <= max_rows else None
+    return _load_numbers(io.StringIO(body, newline=""), ",", columns)
 
 
 def _load_numbers(lines: Iterable[str], delimiter: str | None, columns: int) -> np.ndarray | None:
@@ -240,20 +225,53 @@ def _load_numbers(lines: Iterable[str], delimiter: str | None, columns: int) -> 
     return None
 
 
-def _numbers(path: PathLike, place: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:
-    if len(cells) != len(names):
-        raise input_error(place, f"{len(names)} values ({','.join(names)})", f"{len(cells)} values", path)
-    return [_number(path, f"{place}, {name}", cell) for name, cell in zip(names, cells, strict=True)]
+class _Table(NamedTuple):
+    """A table of text: for each line that is not empty its name in messages, and its cells."""
+
+    path: PathLike
+    separator: str
+    rows: Iterator[tuple[str, list[str]]]
+
+    def numbers(self, line: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:
+        """Numbers of a line that has these columns; `InputError` if it has more or fewer, or other values."""
+        if len(cells) != len(names):
+            raise input_error(line, f"{len(names)} values ({','.join(names)})", f"{len(cells)} values", self.path)
+        return [self.number(f"{line}, {name}", cell) for name, cell in zip(names, cells, strict=True)]
+
+    def number(self, place: str, cell: str, allowed: str = "a finite number") -> float:
+        value = self.parse(cell)
+        if value is None or not math.isfinite(value) or "_" in cell:  # Python reads 1_000; nobody else does
+            raise input_error(place, allowed, short_repr(cell), self.path)
+        return value
+
+    def parse(self, cell: str) -> float | None:
+        """The number of a cell, with a decimal comma unless commas separate; None if it is none."""
+        with contextlib.suppress(ValueError):
+            return float(cell.replace(",", ".") if self.separator != "," and "." not in cell else cell)
+        return None
 
 
-def _number(path: PathLike, place: str, cell: str, allowed: str = "a finite number") -> float:
+def _open_table(path: PathLike, text: str, *, blanks: bool = False) -> _Table:
+    """Split a text into cells, by what separates them in its first line that is not empty; `blanks` may, too.
+
+    Its rows raise `InputError` for a line that is not CSV.
+    """
+    first = next((line for line in io.StringIO(text, newline="") if line.strip()), "")
+    separator = next((mark for mark in _SEPARATORS if mark in first), " " if blanks else ",")
+    return _Table(path, separator, _rows(path, io.StringIO(text, newline=""), separator))
+
+
+def _rows(path: PathLike, lines: Iterable[str], separator: str) -> Iterator[tuple[str, list[str]]]:
+    if separator == " ":
+        # A unit in brackets belongs to the name before it.
+        lines = (re.sub(r"\s+(?=[(\[])", "", " ".join(line.split())) for line in lines)
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or "_" in cell:  # Python reads 1_000; nobody else does
-        raise input_error(place, allowed, short_repr(cell), path)
-    return value
+        for cells in reader:
+            if cells and cells != [""]:
+                yield f"line {reader.line_num}", [cell.strip() for cell in cells]
+    except csv.Error as error:
+        raise InputError(f"{path}: line {reader.line_num} is not CSV: {error}.") from error
 
 
 class Columns(NamedTuple):
@@ -276,28 +294,22 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
     Raises `InputError` if the file cannot be read, lacks the columns, or has lines of different length, cells in them
     that are not finite numbers, too many rows, or a further column twice.
     """
-    lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), 1) if line.strip()]
-    body = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
-    if not body:
+    comment, lines = "", _text(path).splitlines()
+    for line in itertools.takewhile(lambda line: line.lstrip()[:1] in ("", "#"), lines):
+        comment = line.lstrip("# \t") if line.strip() else comment
+    table = _open_table(path, "\n".join("" if line.lstrip().startswith("#") else line for line in lines), blanks=True)
+    line, first = next(table.rows, ("", []))
+    if not first:
         raise InputError(f"{path}: no line; needs a header such as x_mm,y_mm, and a line for each lens.")
-    if len(body) > most + 1:
-        raise input_error("table", f"at most {most} rows", f"more than {most} rows", path)
-    separator = next((mark for mark in _SEPARATORS if mark in body[0][1]), " ")
-    first = _split(path, *body[0], separator)
-    header: list[str] | None = None
-    if not all(_is_number(value, separator) for value in first):
-        header, body = first, body[1:]
-    elif (before := lines.index(body[0])) > 0:
-        comment = _split(path, 0, lines[before - 1][1].lstrip("# \t"), separator)
-        header = comment if len(comment) == len(first) else None
+    rows, header = table.rows, first
+    if all(table.parse(cell) is not None for cell in first):
+        rows = itertools.chain([(line, first)], rows)
+        _, header = next(_rows(path, [comment], table.separator), ("", None))
+        header = header if header and len(header) == len(first) else None
     at = _find_columns(path, header, len(first), wanted)
     names = (header[at[0]], header[at[1]]) if header else None
-    if names and any(_is_number(name, separator) for name in names):
+    if names and any(table.parse(name) is not None for name in names):
         raise input_error("first line", "names, or numbers", short_repr(",".join(first)), path)
-    if body and len(first) == 2:
-        delimiter = None if separator == " " else separator
-        if (plain := _load_numbers((line for _, line in body), delimiter, 2)) is not None:
-            return Columns(plain[:, at], names, {})
     further = {name: header.index(name) for name in also if header and name in header}
     for name in header or ():
         stem = f"{name.rpartition('_')[0]}_mm"
@@ -305,21 +317,16 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
             raise input_error(f"column {short_repr(name)}", stem, "another unit", path)
     if twice := next((name for name in further if (header or []).count(name) > 1), None):
         raise input_error(f"column {short_repr(twice)}", "in the header once", "several", path)
-    called, places = [*(names or "xy"), *further], [*at, *further.values()]
-    rows = []
-    for number, line in body:
-        cells = _split(path, number, line, separator)
+    called, places, numbers = [*(names or "xy"), *further], [*at, *further.values()], []
+    for line, cells in itertools.islice(rows, most + 1):
         if len(cells) != len(first):
             allowed = f"{len(first)} values ({','.join(header) if header else 'as in the first line'})"
-            raise input_error(f"line {number}", allowed, f"{len(cells)} values", path)
-        rows.append(_numbers(path, f"line {number}", called, [_decimal(cells[i], separator) for i in places]))
-    table = np.array(rows, dtype=float).reshape(-1, len(places))
-    return Columns(table[:, :2], names, dict(zip(further, table[:, 2:].T, strict=True)))
-
-
-def _separator(first: str) -> str:
-    """The separator of a table by its first line, which has names: a comma unless it has a semicolon or a tab."""
-    return next((mark for mark in _SEPARATORS if mark in first), ",")
+            raise input_error(line, allowed, f"{len(cells)} values", path)
+        numbers.append(table.numbers(line, called, [cells[place] for place in places]))
+    if len(numbers) > most:
+        raise input_error("table", f"at most {most} rows", f"more than {most} rows", path)
+    columns = np.array(numbers, dtype=float).reshape(-1, len(places))
+    return Columns(columns[:, :2], names, dict(zip(further, columns[:, 2:].T, strict=True)))
 
 
 def _text(path: Path) -> str:
@@ -334,26 +341,6 @@ def _text(path: Path) -> str:
         raise
 
 
-def _split(path: Path, number: int, line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return re.sub(r"\s+(?=[(\[])", "", line).split()  # a unit in brackets belongs to the name before it
-    try:
-        return [value.strip() for value in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
-    except csv.Error as error:
-        raise InputError(f"{path}: line {number} is not CSV: {error}.") from error
-
-
-def _decimal(cell: str, separator: str) -> str:
-    return cell.replace(",", ".") if separator != "," and "." not in cell else cell
-
-
-def _is_number(cell: str, separator: str) -> bool:
-    with contextlib.suppress(ValueError):
-        float(_decimal(cell, separator))
-        return True
-    return False
-
-
 def _find_columns(path: Path, header: list[str] | None, count: int, wanted: Sequence[str] | None) -> tuple[int, int]:
     if wanted is not None:
         if header is None:
@@ -364,9 +351,9 @@ def _find_columns(path: Path, header: list[str] | None, count: int, wanted: Sequ
                 once = f"in the header once ({', '.join(map(repr, header)):.200})"
                 raise input_error(f"column {short_repr(name)}", once, f"it {count} times", path)
         return plain.index(asked[0]), plain.index(asked[1])
-    found = [[i for i, name in enumerate(header or ()) if _is_called(name, pattern)] for pattern in _NAMES]
-    if len(found[0]) == len(found[1]) == 1:
-        return found[0][0], found[1][0]
+    x, y = ([i for i, name in enumerate(header or ()) if _is_called(name, pattern)] for pattern in _NAMES)
+    if len(x) == len(y) == 1:
+        return x[0], y[0]
     if count == 2:
         return 0, 1
     given = f"{count} columns" + (f": {', '.join(map(repr, header)):.160}" if header else " without a header")

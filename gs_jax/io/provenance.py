@@ -29,7 +29,7 @@ from .names import plain_text
 
 Provenance = Mapping[str, str]
 
-# Namespace of annotations and metadata, and key of the table among others.
+# Namespace of annotations, and key of the table among others.
 NAMESPACE, KEY = "gs_jax/provenance", "provenance"
 # Key of a volume's cross-validation in words, which a report shows beside the volume.
 SCORE = "score"
@@ -47,6 +47,11 @@ def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> 
         else:
             table[input_key(path)] = "a folder"
     return table | ({"design": design} if design else {})
+
+
+def annotation(provenance: Provenance | None) -> dict[str, Any]:
+    """Provenance as a structured annotation in the metadata that `tifffile` writes as OME-XML."""
+    return {"MapAnnotation": {"Namespace": NAMESPACE, **provenance}} if provenance else {}
 
 
 def input_key(path: Path) -> str:

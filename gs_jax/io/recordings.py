@@ -1,39 +1,41 @@
 """Opens recordings: pages of a TIFF or an .npy, captures of a folder or a glob, or a Zarr array.
 
-Frames are read when they are asked for, and files of many pages stay open. `WatchedFolder` tells of captures as a
-camera's program writes them.
+Frames are read when they are asked for, and files of many pages stay open. Images of points, one for each plane of a
+measured stack of PSFs, are read in the same way.
 """
 
 import contextlib
 import glob
 import os
-import queue
 import re
-import threading
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.errors import InputError, needs_extra
+from ..base.errors import InputError, InputWarning
 from ..typing import PathLike
 from .axes import UNNAMED, axis_letter, stack_axis, stack_error
+from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
 from .captures import (
     CAPTURE_SUFFIXES,
     OWN,
+    GreyError,
     Images,
     Selection,
     check_colour,
     check_declared,
     check_images,
     check_stack,
+    open_npy,
     read_images,
     read_tiff_page,
 )
 from .files import TIFF_SUFFIXES, check_input, decoding
 from .names import natural_order
-from .ngff import missing_chunk
+from .ngff import import_zarr, missing_chunk, ngff_attributes
 from .tiff import Tiff, open_tiff
 
 _ZARR_ROOTS = (".zarray", ".zgroup", "zarr.json")
@@ -91,10 +93,8 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
     elif page is not None or suffix not in (*TIFF_SUFFIXES, ".npy"):
         yield None
     elif suffix == ".npy":
-        with decoding(check_input(path), ".npy of numbers"):
-            shape = np.lib.format.open_memmap(path, mode="r").shape
-        read = lambda index, selection: read_images(path, selection._replace(page=index + 1))
-        yield _paged(path, shape[0], read) if len(shape) == 3 and shape[0] > 1 else None
+        shape = open_npy(check_input(path)).shape
+        yield _open_npy(path, shape[0]) if len(shape) == 3 and shape[0] > 1 else None
     else:
         with open_tiff(check_input(path)) as tiff:
             yield _open_pages(tiff, axes) if len(tiff.stack.images) > 1 else None
@@ -114,7 +114,10 @@ def _open_pages(tiff: Tiff, axes: str) -> Recording:
     return Recording(names, lambda index, selection: check_images(tiff.path, read(index, selection)), files)
 
 
-def _paged(path: Path, count: int, read: Callable[[int, Selection], Images]) -> Recording:
+def _open_npy(path: Path, count: int) -> Recording:
+    def read(index: int, selection: Selection) -> Images:
+        return read_images(path, selection._replace(page=index + 1))
+
     return Recording([f"{path.name}, page {page}" for page in range(1, count + 1)], read, [path])
 
 
@@ -126,8 +129,12 @@ def capture_files(path: Path) -> list[Path] | None:
         matches = [Path(name) for name in glob.glob(_pattern(path), recursive=True)]
     else:
         return None
-    files = [each for each in matches if each.suffix.lower() in CAPTURE_SUFFIXES and not each.name.startswith(".")]
-    return natural_order(each for each in files if not each.is_dir())
+    return natural_order(match for match in matches if is_capture(match.name) and not match.is_dir())
+
+
+def is_capture(name: str) -> bool:
+    """Whether a file of this name is a capture; one whose name begins with a dot may not be complete."""
+    return name.lower().endswith(CAPTURE_SUFFIXES) and not name.startswith(".")
 
 
 def _pattern(path: Path) -> str:
@@ -143,19 +150,19 @@ def _pattern(path: Path) -> str:
 def _open_files(path: Path, files: list[Path], page: int | str | None) -> Recording:
     if not files:
         raise InputError(f"{path}: no captures; their files end in {', '.join(CAPTURE_SUFFIXES)}.")
-    read = lambda index, selection: read_images(files[index], selection._replace(page=OWN if page is None else page))
-    return Recording([each.name for each in files], read, files)
+
+    def read(index: int, selection: Selection) -> Images:
+        return read_images(files[index], selection._replace(page=OWN if page is None else page))
+
+    return Recording([file.name for file in files], read, files)
 
 
 def _open_zarr(path: Path, page: int | str | None, allowed: str) -> Recording:
-    with needs_extra("zarr"):
-        import zarr
-        from zarr import open as open_zarr
-
+    zarr = import_zarr()
     if page is not None:
         raise InputError(f"--page must not be given for a recording in Zarr, got --page {page} ({path}).")
     with decoding(path, "Zarr store"):
-        store = _only_series(open_zarr(path, mode="r"))
+        store = _only_series(zarr.open(path, mode="r"))
         array = store if isinstance(store, zarr.Array) else _image_array(store)
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: no image; must be a Zarr array (t, y, x), or OME-Zarr of one image.")
@@ -183,21 +190,15 @@ def _open_zarr(path: Path, page: int | str | None, allowed: str) -> Recording:
 
 def _only_series(store):
     """The image of a store that Bio-Formats wrote, whose root has a group for each."""
-    if "bioformats2raw.layout" in _attributes(store):
+    if "bioformats2raw.layout" in ngff_attributes(store):
         series = [group for name, group in store.groups() if name != "OME"]
         return series[0] if len(series) == 1 else store
     return store
 
 
-def _attributes(store) -> dict[str, Any]:
-    """NGFF's attributes, which version 0.5 has in `ome`."""
-    attributes = store.attrs.asdict()
-    return attributes.get("ome", attributes)
-
-
-def _image_array(group):
+def _image_array(group) -> Any:
     """The full-size array of OME-Zarr of one image, or the only array of a group."""
-    images = _attributes(group).get("multiscales") or [{}]
+    images = ngff_attributes(group).get("multiscales") or [{}]
     if len(images) == 1 and (datasets := images[0].get("datasets")):
         return group[datasets[0]["path"]]
     arrays = [array for _, array in group.arrays()]
@@ -208,91 +209,72 @@ def _axes(store, array) -> list[str]:
     """Names of the axes of an array: NGFF's, those of Zarr 3, or xarray's."""
     count = array.ndim
     with contextlib.suppress(KeyError, TypeError, AttributeError, IndexError):
-        axes = [axis_letter(axis["name"], axis.get("type")) for axis in _attributes(store)["multiscales"][0]["axes"]]
+        axes = ngff_attributes(store)["multiscales"][0]["axes"]
         if len(axes) == count:
-            return axes
+            return [axis_letter(axis["name"], axis.get("type")) for axis in axes]
     names = getattr(array.metadata, "dimension_names", None) or array.attrs.asdict().get("_ARRAY_DIMENSIONS")
     names = [axis_letter("" if name is None else name) for name in names or ()]
     return names if len(names) == count else [UNNAMED] * count
 
 
-# Milliseconds: between two looks of the watching library, and the longest time for which it gathers changes.
-_STEP, _GATHER = 4, 8
-# Milliseconds without a change after which the folder is listed, in case that a change was lost.
-_LISTED = 2000
-
-
-class WatchedFolder:
-    """Context manager that tells which captures of a folder are new or were written to.
+def read_spots(
+    paths: Sequence[Path],
+    *,
+    page: int | str | None = None,
+    readout: Readout = Readout(),
+    correction: Correction = Correction(),
+) -> Iterator[tuple[Path, Corrected]]:
+    """Read and correct images of a point, and yield each with its file.
 
     Parameters
     ----------
-    folder
-        Its captures, not those of folders in it. Names that begin with a dot are left out, so that a program may write
-        a file under such a name and rename it.
+    paths
+        TIFF, PNG or .npy, each with a page or several; folders or patterns of such files; Zarr arrays (z, y, x).
+    page
+        None: a plane for each page. A page, or "mean" of all: a plane for each file.
+    readout, correction
+        As for `read_corrected`. With `bad_pixels="auto"` no pixel is taken for a hot one: a spot may be as sharp. A
+        channel is selected of images in colour alone.
 
     Raises
     ------
     InputError
-        If it is no folder, or `watchfiles` is not installed.
+        As `open_recording` and `read_corrected`.
     """
+    if correction.bad_pixels == "auto":
+        correction = correction._replace(bad_pixels="none")
+    selection = Selection(None, page, readout.channel, readout.bayer)
+    prepared: dict[Any, Prepared] = {}
+    for path in paths:
+        with open_recording(path, page=page, axes="tz") as recording:
+            stack = recording or Recording([path.name], lambda _, selected, path=path: read_images(path, selected), [])
+            for plane, name in enumerate(stack.names):
+                own = readout
+                try:
+                    images = list(stack.images(plane, selection))
+                except GreyError:
+                    own = readout._replace(channel=None)
+                    images = list(stack.images(plane, selection._replace(channel=None)))
+                shape = images[0].shape
+                if (key := (shape, own)) not in prepared:
+                    cells = (shape[0] // 2, shape[1] // 2)
+                    prepared[key] = prepare(cells if own.bayer else shape, shape, own, correction)
+                yield path, read_frame(name, iter(images), prepared[key], own)
 
-    def __init__(self, folder: Path):
-        if not folder.is_dir():
-            raise InputError(f"{folder} must be a folder to be watched, got {'a file' if folder.exists() else 'none'}.")
-        with needs_extra("live"):
-            import watchfiles
-        self.folder, self._watch = folder, watchfiles.watch
-        self._changes: queue.SimpleQueue[list[str] | Exception] = queue.SimpleQueue()
-        self._told: set[str] = set()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> "WatchedFolder":
-        self._thread.start()
-        return self
+def spot_names(paths: Sequence[Path], page: int | str | None = None) -> list[str]:
+    """Names of the images of `read_spots`, in their order; warns where files are in the order of texts, not numbers.
 
-    def __exit__(self, *_) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def changes(self, timeout: float) -> list[str]:
-        """Names of captures that are new or have changed since the last call, in natural order.
-
-        If there are none, waits for the first for so many seconds. Names may be told twice.
-        """
-        names: list[str] = []
-        try:
-            while True:
-                found = self._changes.get(timeout=timeout) if not names and timeout else self._changes.get_nowait()
-                if isinstance(found, Exception):
-                    raise found
-                names += found
-        except queue.Empty:
-            return natural_order(dict.fromkeys(names))
-
-    def _run(self) -> None:
-        how = {"step": _STEP, "debounce": _GATHER, "rust_timeout": _LISTED, "yield_on_timeout": True}
-        listed = True
-        try:
-            self._tell(os.listdir(self.folder), listed)
-            for changes in self._watch(
-                self.folder, watch_filter=None, stop_event=self._stop, recursive=False, raise_interrupt=False, **how
-            ):
-                # What came before the library began to watch is in the list.
-                listed = listed or not changes
-                if listed:
-                    self._tell(os.listdir(self.folder), listed)
-                self._tell([os.path.basename(path) for _, path in changes], listed=False)
-                listed = False
-        except OSError as error:
-            self._changes.put(InputError(f"{self.folder}: cannot be watched any more: {error.strerror or error}."))
-
-    def _tell(self, names: list[str], listed: bool) -> None:
-        captures = [name for name in names if name.lower().endswith(CAPTURE_SUFFIXES) and not name.startswith(".")]
-        captures = [name for name in captures if name not in self._told] if listed else captures
-        # The library also tells of files that are deleted.
-        captures = [name for name in captures if (self.folder / name).is_file()]
-        self._told.update(captures)
-        if captures:
-            self._changes.put(captures)
+    Raises `InputError` as `open_recording`.
+    """
+    names = [path.name for path in paths]
+    if names == sorted(names) and names != (ordered := natural_order(names)):
+        text = f"{names[0]} to {names[-1]} are taken in this order; by their numbers {ordered[0]} is the first"
+        warnings.warn(
+            InputWarning(f"{text}, and {ordered[-1]} the last: give their folder to sort them so."), stacklevel=2
+        )
+    names = []
+    for path in paths:
+        with open_recording(path, page=page, axes="tz") as several:
+            names += several.names if several else [path.name]
+    return names

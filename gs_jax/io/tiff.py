@@ -18,11 +18,9 @@ import tifffile
 from PIL import Image, UnidentifiedImageError
 
 from ..base.errors import InputError, InputWarning, input_error
-from .axes import UNNAMED, axis_letter
+from .axes import UNNAMED, OmePlanes, axis_letter, is_ome, read_ndtiff, read_ome
 from .files import decoding
 from .names import natural_order
-from .ndtiff import read_ndtiff
-from .ome import OmePlanes, is_ome, read_ome
 
 # Tags of TIFF/EP: the size of a mosaic's cell and its colours, which are numbered as in "RGB".
 _CELL, _PATTERN = 33421, 33422

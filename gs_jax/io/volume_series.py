@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from ..base.errors import InputError, input_error, needs_extra, short_repr
+from ..base.errors import InputError, input_error, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
 from .files import JOURNAL, atomic_write, decoding, disk_errors_name
-from .ngff import CHUNK, frame_shards, image_attributes, plain_depths, um
+from .ngff import CHUNK, frame_shards, image_attributes, import_zarr, ngff_attributes, plain_depths, um
 from .provenance import Provenance, surface_of
 
 Note = dict[str, Any]
@@ -139,10 +139,7 @@ class VolumeSeries:
         self._journaled = count
 
     def _create(self, volume: Volume) -> None:
-        with needs_extra("zarr"):
-            import zarr
-
-        shapes = _pyramid(volume.shape[1:])
+        zarr, shapes = import_zarr(), _pyramid(volume.shape[1:])
         depths = plain_depths(self.grid)
         in_time = {"in_time": True, "interval": self.interval}
         attributes = image_attributes(self.path, depths, self.grid, len(shapes), volume, self.provenance, **in_time)
@@ -187,17 +184,13 @@ class VolumeSeries:
 
 def open_levels(path: Path, grid: Grid) -> list[Any]:
     """Open the arrays of an existing store for writing: the full size, and each next of half its rows and columns."""
-    with needs_extra("zarr"):
-        import zarr
-
-    group = zarr.open_group(path, mode="r+")
+    group = import_zarr().open_group(path, mode="r+")
     return [group[str(level)] for level in range(len(_pyramid(grid.shape)))]
 
 
 def write_frame(path: Path, levels: list[Any], frame: int, volume: Volume) -> None:
     """Write the volume of a frame to arrays of `open_levels`: one file each, whole or not at all."""
-    import zarr
-
+    zarr = import_zarr()
     # Plane by plane, as zarr does otherwise, takes twice as long: each is handed to another thread and waited for.
     with disk_errors_name(path, path), zarr.config.set({"codec_pipeline.batch_size": len(volume)}):
         for level, array in enumerate(levels):
@@ -237,14 +230,10 @@ def read_series(path: PathLike) -> Series | None:
     """Open what `VolumeSeries` wrote; None if it is anything else."""
     if _read_head(path) is None:
         return None
-    with needs_extra("zarr"):
-        import zarr
-
+    zarr = import_zarr()
     with decoding(path, "OME-Zarr"):
         group = zarr.open_group(path, mode="r")
-        attributes: Any = group.attrs.asdict()
-        # Version 0.4 has these at the root.
-        attributes = attributes.get("ome", attributes)
+        attributes = ngff_attributes(group)
         (image,), window = attributes["multiscales"], attributes["omero"]["channels"][0]["window"]
         scale, first = image["datasets"][0]["coordinateTransformations"]
         interval = scale["scale"][0] if "unit" in image["axes"][0] else None

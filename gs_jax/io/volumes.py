@@ -1,42 +1,60 @@
-"""Reads and writes volumes: OME-TIFF, or OME-Zarr when the name ends in `.zarr`.
+"""Reads and writes volumes and planes as OME-TIFF or, when the name ends in `.zarr`, as OME-Zarr; sheets as OME-TIFF.
 
-Both hold float32 voxels `[depth, row, column]` as they are, the grid in micrometres (lateral pitch, every depth, centre
+All hold float32 values `[depth, row, column]` as they are, the grid in micrometres (lateral pitch, every depth, centre
 of the first voxel), so that Fiji and napari show the volume to scale and in place, and a display range.
 
-An OME-TIFF has ImageJ's description after OME's: readers of TIFF take the first, ImageJ without Bio-Formats the last.
+The OME-TIFF of a volume has ImageJ's description after OME's: readers of TIFF take the first, ImageJ without
+Bio-Formats the last.
 
 OME-Zarr is written in version 0.4 (Zarr 2), which every reader of Fiji and napari knows, rather than 0.5 (Zarr 3);
 both are read. Chunks are one plane deep, as viewers ask for planes, and compressed with Blosc (LZ4), the default of
 bioformats2raw and ome-zarr-py.
-
-To add a format, add its suffix to `_FORMATS` with a function that reads it and one that writes it.
 """
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
-from jaxtyping import Array, Shaped
+from jaxtyping import Array, Float, Float32, Int, Shaped
 
 from ..base.arrays import host_code
-from ..base.errors import InputError, input_error, needs_extra, short_repr
+from ..base.errors import InputError, input_error, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
+from .captures import write_npy
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
-from .lengths import mm_per
-from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
-from .provenance import NAMESPACE, Provenance, moved, surface_of
-from .tiff import decode_page, open_tiff
+from .names import mm_per
+from .ngff import (
+    display_range,
+    first_um,
+    image_attributes,
+    import_zarr,
+    ngff_attributes,
+    plain_depths,
+    plane_chunks,
+    title,
+    um,
+)
+from .provenance import Provenance, annotation, moved, surface_of, write_sidecar
+from .tiff import decode_page, decode_plane, open_tiff
 
+VOLUME_SUFFIXES = (*TIFF_SUFFIXES, ".zarr")
+STACK_SUFFIXES = (*VOLUME_SUFFIXES, ".npy")
+SURFACE_SUFFIXES = (*TIFF_SUFFIXES, ".ply")
 MAX_VOXELS = 10**10
-
 # Tags of TIFF: a description, and the tag after it, in whose place a second description is written.
 _DESCRIPTION, _AFTER = 270, 271
+# Channels of a sheet.
+_CHANNELS = ("brightness", "depth_um", "sd_um")
+# Neighbours whose depths differ by more voxels than this lie on different parts of the scene.
+_STEEP = 4
+
+Maps = Float[np.ndarray, "sheet y x"]
 
 
 @host_code()
@@ -81,7 +99,16 @@ def write_volume(
         raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
         raise ValueError("`volume` must be finite, got a NaN or an infinity.")
-    _FORMATS[path.suffix.lower()].write(path, voxels, plain_depths(grid), grid, provenance or {})
+    depths = plain_depths(grid)
+    if path.suffix.lower() == ".zarr":
+        attributes, zarr = image_attributes(path, depths, grid, 1, voxels, provenance), import_zarr()
+        with atomic_write(path) as temporary:
+            group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
+            array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **plane_chunks(voxels.shape))
+            array[...] = voxels
+    else:
+        known = {"depths": depths, "pitch": grid.pitch, "first": first_um(grid)}
+        _write_ome(path, voxels, "ZYX", provenance, **known, for_imagej=True)
 
 
 def read_volume(path: PathLike) -> tuple[Volume, Grid]:
@@ -106,10 +133,49 @@ def read_volume(path: PathLike) -> tuple[Volume, Grid]:
     >>> volume.shape, same.pitch
     ((3, 41, 41), 0.1)
     """
-    voxels, grid = _FORMATS[check_suffix(path, VOLUME_SUFFIXES)].read(Path(path))
+    read = _read_zarr if check_suffix(path, VOLUME_SUFFIXES) == ".zarr" else _read_tiff
+    voxels, grid = read(Path(path))
     if not np.isfinite(voxels).all():
         raise input_error("voxels", "finite", "a NaN or an infinity", path)
     return voxels, grid
+
+
+def write_planes(
+    path: Path,
+    planes: Float32[np.ndarray, "depth row column"],
+    depths: Sequence[float] | None = None,
+    pitch: float | None = None,
+    provenance: Provenance | None = None,
+) -> None:
+    """Write planes as a volume, with the lengths that are known; whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Ends in `.tif`, `.tiff` (best `.ome.tif`) or `.npy`; or in `.zarr`, if all lengths are known.
+    planes
+        As they are.
+    depths
+        Depth of each plane, mm. None: planes have numbers alone.
+    pitch
+        Lateral pitch of voxels, mm. None: voxels are a pixel wide.
+    provenance
+        Kept in the file, or beside an .npy.
+
+    Raises
+    ------
+    InputError
+        As `check_output` and `write_volume`, or if a length is missing for Zarr.
+    """
+    suffix = check_output(path, STACK_SUFFIXES).suffix.lower()
+    if suffix == ".npy":
+        write_npy(path, planes, provenance)
+    elif depths is not None and pitch is not None:
+        write_volume(path, planes, Grid(depths, planes.shape[1:], pitch), provenance)
+    elif suffix == ".zarr":
+        raise input_error("--depths and --voxel-um", "given for OME-Zarr, which has all lengths", "not both", path)
+    else:
+        _write_ome(path, planes, "ZYX", provenance, depths=depths, pitch=pitch)
 
 
 def _as_float32(path: Path, voxels: np.ndarray) -> Volume:
@@ -138,7 +204,7 @@ def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None
         raise input_error("voxels", "float32, or integers up to 16 bits", dtype, path)
 
 
-def checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
+def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
     """Grid of depths, pitches `(y, x)` and centre of the first voxel `(y, x)`, mm; centred if `first` is None.
 
     Its depths are from the array, also where those of the file count from the sample's surface.
@@ -160,51 +226,59 @@ def checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitche
     return Grid(depths, shape, pitch, (x, y))
 
 
-# OME-TIFF
+def _write_ome(
+    path: Path,
+    planes: np.ndarray,
+    axes: str,
+    provenance: Provenance | None,
+    *,
+    depths: Sequence[float] | None = None,
+    pitch: float | None = None,
+    first: tuple[float, float] | None = None,
+    channels: Sequence[str] = (),
+    for_imagej: bool = False,
+) -> None:
+    """Write planes as OME-TIFF, with the depths and the pitch (mm) and the centre of the first voxel (um) if known.
 
-
-def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
-    planes, pitch, (first_y, first_x) = len(depths), grid.pitch, first_um(grid)
-    plane: dict[str, Any] = {"PositionZ": [um(depth) for depth in depths]}
-    plane |= {"PositionX": [first_x] * planes, "PositionY": [first_y] * planes}
-    metadata = {"axes": "ZYX", "Name": title(path), "PhysicalSizeX": um(pitch), "PhysicalSizeY": um(pitch)}
+    `channels` are names of planes that are channels; `for_imagej` adds the description of ImageJ, if all is known.
+    """
     # The mean step of uneven depths serves viewers that know one step only; the planes have exact depths.
-    step = float(np.mean(np.abs(np.diff(depths)))) if planes > 1 else 0.0
-    if step > 0:
-        metadata["PhysicalSizeZ"] = um(step)
-    metadata |= {f"{name}Unit": "µm" for name in list(metadata) if name.startswith("PhysicalSize")}
-    metadata["Plane"] = plane | {f"{name}Unit": ["µm"] * planes for name in plane}
-    if provenance:
-        metadata["MapAnnotation"] = {"Namespace": NAMESPACE, **provenance}
-    imagej = _imagej_description(voxels, um(pitch), um(step), (first_x, first_y, um(depths[0])))
-    per_um = 1 / um(pitch)  # the unit is in ImageJ's description: TIFF has inches and centimetres only
+    step = float(np.mean(np.abs(np.diff(depths)))) if depths is not None and len(depths) > 1 else 0.0
+    sizes = {axis: um(length) for axis, length in (("X", pitch), ("Y", pitch), ("Z", step)) if length}
+    at = dict(zip("YX", first or (), strict=False))
+    positions = {axis: [at[axis]] * len(planes) for axis in "XY" if axis in at}
+    positions |= {"Z": list(map(um, depths))} if depths is not None else {}
+    metadata: dict[str, Any] = {"axes": axes, "Name": title(path)}
+    metadata |= {f"PhysicalSize{axis}": size for axis, size in sizes.items()}
+    metadata |= {f"PhysicalSize{axis}Unit": "µm" for axis in sizes}
+    plane = {f"Position{axis}": values for axis, values in positions.items()}
+    plane |= {f"Position{axis}Unit": ["µm"] * len(planes) for axis in positions}
+    metadata |= ({"Plane": plane} if plane else {}) | ({"Channel": {"Name": channels}} if channels else {})
+    metadata |= annotation(provenance)
+    options: dict[str, Any] = {}
+    if for_imagej:
+        description = _imagej_description(planes, sizes, {axis: values[0] for axis, values in positions.items()})
+        # The unit is in ImageJ's description: TIFF has inches and centimetres only.
+        options = {"resolution": (1 / sizes["X"], 1 / sizes["X"]), "resolutionunit": "NONE"}
+        options |= {"extratags": [(_AFTER, 2, 0, description, True)]}
     with atomic_write(path) as temporary:
-        tifffile.imwrite(
-            temporary,
-            voxels,
-            ome=True,
-            photometric="minisblack",
-            metadata=metadata,
-            resolution=(per_um, per_um),
-            resolutionunit="NONE",
-            extratags=[(_AFTER, 2, 0, imagej, True)],
-        )
-        # tifffile writes one description, so the second one has another tag until here.
-        with tifffile.TiffFile(temporary) as tiff:
-            entry, order = tiff.pages.first.tags[_AFTER].offset, tiff.byteorder
-        with temporary.open("r+b") as file:
-            file.seek(entry)
-            file.write(_DESCRIPTION.to_bytes(2, "little" if order == "<" else "big"))
+        tifffile.imwrite(temporary, planes, ome=True, photometric="minisblack", metadata=metadata, **options)
+        if for_imagej:
+            # tifffile writes one description, so the second one has another tag until here.
+            with tifffile.TiffFile(temporary) as tiff:
+                entry, order = tiff.pages.first.tags[_AFTER].offset, tiff.byteorder
+            with temporary.open("r+b") as file:
+                file.seek(entry)
+                file.write(_DESCRIPTION.to_bytes(2, "little" if order == "<" else "big"))
 
 
-def _imagej_description(voxels: np.ndarray, pitch_um: float, step_um: float, first_um: tuple[float, ...]) -> str:
-    """ImageJ's description of a stack whose first voxel is at `(x, y, z)`; without a step it is one plane."""
+def _imagej_description(voxels: np.ndarray, sizes: dict[str, float], first: dict[str, float]) -> str:
+    """ImageJ's description of a stack, from steps and the centre of the first voxel, um; without a step, of a plane."""
     low, high = display_range(voxels)
     stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
-    spacing = f"spacing={step_um}\n" if step_um > 0 else ""
-    sides = {"x": pitch_um, "y": pitch_um, "z": step_um}
+    spacing = f"spacing={sizes['Z']}\n" if "Z" in sizes else ""
     # The position of zero, in voxels.
-    zero = "".join(f"{a}origin={-at / sides[a]:.6f}\n" for a, at in zip("xyz", first_um, strict=True) if sides[a])
+    zero = "".join(f"{axis.lower()}origin={-first[axis] / size:.6f}\n" for axis, size in sizes.items())
     return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}{zero}loop=false\nmin={low}\nmax={high}\n"
 
 
@@ -239,17 +313,22 @@ def _grid_of_ome(path: Path, root: ElementTree.Element, shape: tuple[int, int, i
     for index in range(shape[0]):
         if str(index) not in planes:
             raise InputError(f"{path}: no `PositionZ` of plane {index + 1}; a depth for each plane is needed.")
-    ordered = [planes[str(index)] for index in range(shape[0])]
-    depths = [ome_length(path, plane, "PositionZ", "reference frame") for plane in ordered]
-    pitches = [ome_length(path, pixels, f"PhysicalSize{axis}", "µm") for axis in "YX"]
-    placed = all(ordered[0].get(f"Position{axis}") is not None for axis in "YX")
-    first = [ome_length(path, ordered[0], f"Position{axis}", "reference frame") for axis in "YX"] if placed else None
-    return checked_grid(path, depths, shape[1:], pitches, first)
+    depths = [_ome_length(path, planes[str(index)], "PositionZ") for index in range(shape[0])]
+    is_centred = any(planes["0"].get(f"Position{axis}") is None for axis in "YX")
+    return _lateral_grid(path, depths, shape[1:], pixels, None if is_centred else planes["0"])
 
 
-def ome_length(path: Path, element: ElementTree.Element, name: str, default_unit: str) -> float:
-    """An attribute of OME-XML in mm; `default_unit` is the schema's, where the attribute `...Unit` is missing."""
-    text, unit = element.get(name), element.get(f"{name}Unit", default_unit)
+def _lateral_grid(path: Path, depths: list[float], shape, pixels: ElementTree.Element, first) -> Grid:
+    """Grid of depths (mm), with pitches of OME's `Pixels` and the position of the plane `first`, centred without."""
+    pitches = [_ome_length(path, pixels, f"PhysicalSize{axis}") for axis in "YX"]
+    at = None if first is None else [_ome_length(path, first, f"Position{axis}") for axis in "YX"]
+    return _checked_grid(path, depths, shape, pitches, at)
+
+
+def _ome_length(path: Path, element: ElementTree.Element, name: str) -> float:
+    """A length or a position of OME-XML in mm; without a unit it is in that of the schema."""
+    text = element.get(name)
+    unit = element.get(f"{name}Unit", "µm" if name.startswith("PhysicalSize") else "reference frame")
     try:
         return _mm(float(text or ""), mm_per(unit))
     except (ValueError, KeyError) as error:
@@ -257,31 +336,15 @@ def ome_length(path: Path, element: ElementTree.Element, name: str, default_unit
         raise input_error(f"OME-XML `{name}`", "a length in µm", given, path) from error
 
 
-# OME-Zarr
-
-
-def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
-    with needs_extra("zarr"):
-        import zarr  # 0.15 s that TIFF does not need
-
-    attributes = image_attributes(path, depths, grid, 1, voxels, provenance)
-    with atomic_write(path) as temporary:
-        group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
-        array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **plane_chunks(voxels.shape))
-        array[...] = voxels
-
-
 def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
-    with needs_extra("zarr"):
-        import zarr
-
+    zarr = import_zarr()
     if not os.path.exists(path):
         raise InputError(f"{path}: cannot be read: no such folder.")
     if not os.path.isdir(path):
         raise input_error("volume", "a Zarr folder", "a file", path)
     with decoding(path, "OME-Zarr"):
         group = zarr.open_group(path, mode="r")
-        attributes = group.attrs.asdict()
+        attributes = ngff_attributes(group)
     name, scale, first = _parse_multiscales(path, attributes)
     with decoding(path, "OME-Zarr"):
         array = group[name]
@@ -290,15 +353,15 @@ def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
     _check_declared(path, array.shape, array.dtype)
     depths, rows, columns = array.shape
     z = [_mm(first[0] + index * scale[0], 1.0) for index in range(depths)]
-    grid = checked_grid(path, z, (rows, columns), scale[1:], first[1:])
+    grid = _checked_grid(path, z, (rows, columns), scale[1:], first[1:])
     with decoding(path, "OME-Zarr"):
         return np.asarray(array[...], dtype=np.float32), grid
 
 
 def _parse_multiscales(path: Path, attributes: dict[str, Any]) -> tuple[str, list[float], list[float]]:
-    """Name of the full-size array, scale and translation `(z, y, x)` in mm, of NGFF 0.4, or 0.5 (in `ome`)."""
+    """Name of the full-size array, scale and translation `(z, y, x)` in mm, of NGFF 0.4 or 0.5."""
     try:
-        (multiscale,) = attributes.get("ome", attributes)["multiscales"]
+        (multiscale,) = attributes["multiscales"]
         axes = [(axis["name"], mm_per(axis["unit"])) for axis in multiscale["axes"]]
         if [name for name, _ in axes] != ["z", "y", "x"] or "coordinateTransformations" in multiscale:
             raise ValueError("not three axes with one scale each")
@@ -314,13 +377,117 @@ def _parse_multiscales(path: Path, attributes: dict[str, Any]) -> tuple[str, lis
         raise input_error("`multiscales`", allowed, f"{error!r:.80}", path) from error
 
 
-class _Format(NamedTuple):
-    """How a volume is read, and how float32 voxels are written with their depths (mm) and grid."""
+class SurfaceMaps(NamedTuple):
+    """Sheets of a file: brightness, depth from the array and its standard deviation, mm, and where the columns are."""
 
-    read: Callable[[Path], tuple[np.ndarray, Grid]]
-    write: Callable[[Path, np.ndarray, list[float], Grid, Provenance], None]
+    brightness: Maps
+    depth: Maps
+    depth_sd: Maps
+    grid: Grid
 
 
-_TIFF, _ZARR = _Format(_read_tiff, _write_tiff), _Format(_read_zarr, _write_zarr)
-_FORMATS = {**dict.fromkeys(TIFF_SUFFIXES, _TIFF), ".zarr": _ZARR}
-VOLUME_SUFFIXES = tuple(_FORMATS)
+class Mesh(NamedTuple):
+    """Triangles between lit neighbours of sheets: vertices `(x, y, z)`, mm, and their brightness, from 0 to 1."""
+
+    vertices: Float[np.ndarray, "vertex 3"]
+    brightness: Float[np.ndarray, " vertex"]
+    faces: Int[np.ndarray, "face 3"]
+
+
+def write_surface(
+    path: PathLike,
+    brightness: Maps,
+    depth: Maps,
+    depth_sd: Maps,
+    grid: Grid,
+    *,
+    below: float = 0.0,
+    provenance: Provenance | None = None,
+) -> None:
+    """Writes sheets, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Ends in `.tif` or `.tiff` (best `.ome.tif`): brightness, depth and its standard deviation, um, as channels of a
+        float32 image; NaN where it is dark. Or in `.ply`: a mesh in mm, coloured by brightness.
+    brightness, depth, depth_sd
+        As in `SurfaceFit`, mm.
+    grid
+        Positions of the columns.
+    below
+        Depth from which those of the file count, mm.
+    provenance
+        Kept in the OME-TIFF, or beside a mesh.
+
+    Raises
+    ------
+    InputError
+        As `check_output`.
+    """
+    path = check_output(path, SURFACE_SUFFIXES)
+    depth = depth - np.float32(below)
+    if path.suffix.lower() == ".ply":
+        data = _ply(surface_mesh(brightness, depth, grid))
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(data)
+        write_sidecar(path, provenance)
+        return
+    sheets = range(1, len(depth) + 1)
+    names = [f"{what}{f' {n}' if len(sheets) > 1 else ''}" for n in sheets for what in _CHANNELS]
+    planes = np.stack([brightness, 1000 * depth, 1000 * depth_sd], 1, dtype=np.float32).reshape(-1, *depth.shape[1:])
+    _write_ome(path, planes, "CYX", provenance, pitch=grid.pitch, first=first_um(grid), channels=names)
+
+
+def read_surface(path: PathLike) -> SurfaceMaps:
+    """Read an OME-TIFF of `write_surface`.
+
+    Depths are returned relative to the array, also for files that store them relative to the sample. Raises
+    `InputError` if it cannot be read, or holds no sheets.
+    """
+    check_suffix(path, TIFF_SUFFIXES)
+    path = check_input(path)
+    with open_tiff(path, "OME-TIFF") as tiff:
+        with decoding(path, "OME-TIFF"):
+            words = tiff.first.description
+            pixels = ElementTree.fromstring(words).find("{*}Image/{*}Pixels") if words.startswith("<?xml") else None
+        names = [] if pixels is None else [each.get("Name", "") for each in pixels.findall("{*}Channel")]
+        planes = [decode_plane(*tiff.at(image, number)) for number, image in enumerate(tiff.stack.images)]
+        with decoding(path, "OME-TIFF"):
+            maps = np.stack(planes)
+    count = len(maps) // len(_CHANNELS)
+    kinds = [name.split(" ")[0] for name in names]
+    if pixels is None or kinds != [*_CHANNELS] * count or len(kinds) != len(maps) or maps.dtype != np.float32:
+        raise input_error("channels", f"{', '.join(_CHANNELS)} of float32, as --surface writes", names or "none", path)
+    brightness, depth, sd = maps.reshape(count, len(_CHANNELS), *maps.shape[1:]).swapaxes(0, 1)
+    depth = depth / np.float32(1000)
+    middle = float(np.nanmedian(depth)) if np.isfinite(depth).any() else 1.0
+    first = next(pixels.iterfind("{*}Plane"), ElementTree.Element("Plane"))
+    grid = _lateral_grid(path, [middle], maps.shape[1:], pixels, first)
+    return SurfaceMaps(brightness, depth + np.float32(surface_of(path)), sd / np.float32(1000), grid)
+
+
+def surface_mesh(brightness: Maps, depth: Maps, grid: Grid) -> Mesh:
+    """Triangles between lit neighbours, of all sheets, but where the depth jumps."""
+    y, x = np.meshgrid(np.asarray(grid.y), np.asarray(grid.x), indexing="ij")
+    number = np.arange(depth.size).reshape(depth.shape)
+    corners = [np.s_[:, :-1, :-1], np.s_[:, :-1, 1:], np.s_[:, 1:, 1:], np.s_[:, 1:, :-1]]
+    around = np.stack([depth[part] for part in corners])
+    # Where it is dark the range is NaN, which is not small.
+    flat = np.ptp(around, axis=0) <= _STEEP * grid.pitch
+    a, b, c, d = (number[part][flat] for part in corners)
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    vertices = np.stack([np.broadcast_to(x, depth.shape), np.broadcast_to(y, depth.shape), depth], -1).reshape(-1, 3)
+    light = np.clip(brightness / max(np.percentile(brightness, 99.5), 1e-30), 0, 1).reshape(-1)
+    used, faces = np.unique(faces, return_inverse=True)
+    return Mesh(vertices[used], light[used], faces.reshape(-1, 3))
+
+
+def _ply(mesh: Mesh) -> bytes:
+    """A mesh as PLY, coloured by brightness."""
+    import trimesh  # 0.3 s that images do not need
+
+    grey = (255 * mesh.brightness).astype(np.uint8)
+    colours = np.stack([grey, grey, grey, np.full_like(grey, 255)], -1)
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+    return bytes(cast(bytes, made.export(file_type="ply")))

@@ -19,9 +19,8 @@ from ..cli.options import DESIGN, CaptureOptions, Depths, depth_range
 from ..grid import Grid
 from ..io.ngff import display_range
 from ..io.point_tables import POINTS_HEADER, read_points
-from ..io.surfaces import SurfaceMaps, read_surface, surface_mesh
 from ..io.volume_series import Series, read_series
-from ..io.volumes import VOLUME_SUFFIXES, read_volume
+from ..io.volumes import VOLUME_SUFFIXES, SurfaceMaps, read_surface, read_volume, surface_mesh
 from ..typing import Points
 
 # Seconds between looks whether the user cancelled.
@@ -110,7 +109,7 @@ def newest_captures(folder: Path, make: Callable[[str, Path], Result], progress:
 
     Raises `InputError` if the folder cannot be watched.
     """
-    from ..io.recordings import WatchedFolder
+    from ..io.watched_folder import WatchedFolder
     from ..reconstruction.recording import SETTLED
 
     name, since = "", 0.0

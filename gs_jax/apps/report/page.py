@@ -17,7 +17,7 @@ from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
-from ...io.surfaces import SurfaceMaps, surface_mesh
+from ...io.volumes import SurfaceMaps, surface_mesh
 from ...optics.raytrace import to_numpy
 from ...pictures import color_table, make_slices, png_uri, scale_bar_html, slider_html, to_base64, to_uint8
 from ...typing import Image, PathLike, Points
