@@ -25,6 +25,7 @@ from rich.json import JSON
 from scipy.ndimage import gaussian_filter
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
+from experiments.phantoms import snowflake
 from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
 from gs_jax.apps.example_pipeline import words
@@ -35,7 +36,7 @@ from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
 from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.phantoms import rasterize, snowflake
+from gs_jax.simulation.phantoms import rasterize
 from gs_jax.simulation.synthetic import Camera, electrons, expose, simulate_points
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))

@@ -29,6 +29,7 @@ from jaxtyping import Float32, Num
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, points_of
+from experiments.phantoms import snowflake
 from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
@@ -47,7 +48,7 @@ from gs_jax.optics.theory import FWHM
 from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.networks import read_unrolled
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, reconstruct, voxel_grid
-from gs_jax.simulation.phantoms import letters, rasterize, snowflake
+from gs_jax.simulation.phantoms import letters, rasterize
 from gs_jax.simulation.synthetic import Camera, expose
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")

@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from experiments.common import Report, cropped, main, table
+from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, Sensor, Surface, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
@@ -33,7 +34,6 @@ from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
 from gs_jax.reconstruction.surface_fit import fit_sheets
-from gs_jax.simulation.phantoms import snowflake
 
 PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)
 ELECTRONS, READ = (10_000, 500), 2.0

@@ -66,7 +66,16 @@ def test_links_exist(path):
 # Commands that a page must show, among others.
 SHOWN = {
     "design/LAB.md": {"new-design", "calibrate", "reconstruct", "metrics", "simulate", "info"},
-    "docs/howto/own_numbers.md": {"new-design", "metrics", "optimize", "simulate", "report", "tolerance", "mold", "mask"},
+    "docs/howto/own_numbers.md": {
+        "new-design",
+        "metrics",
+        "optimize",
+        "simulate",
+        "report",
+        "tolerance",
+        "mold",
+        "mask",
+    },
     "design/CLUSTER.md": {"reconstruct", "optimize", "pareto", "train"},
 }
 

@@ -24,116 +24,13 @@ from ..typing import Number
 
 Emitters = Float[np.ndarray, "emitter 4"]
 
-# Bars of a USAF element of width 1, a corner at the origin: three across x, a gap of two widths, three across y.
-_ELEMENT = np.array([(x, x + 1, 0, 5) for x in (0, 2, 4)] + [(7, 12, y, y + 1) for y in (0, 2, 4)], float)
-# Centre lines of a snowflake's arm along +x, of length 1, from and to x + iy.
-_SIDES = np.exp(1j * np.pi / 3 * np.array([1, -1]))
-_ARM = np.array([(0, 1), *((x, x + length * side) for x, length in ((0.45, 0.27), (0.72, 0.2)) for side in _SIDES)])
 # Smallest height of rendered text in pixels, as Pillow fits letters to whole pixels.
 _LEAST_ROWS = 600
 
 
 def random_points(count: int, size: Sequence[Number], depth_range: Sequence[Number], *, seed: int = 0) -> Emitters:
     """Points of intensity 1, uniform in a box of the size `(x, y)` on the axis and the depths `(near, far)`, mm."""
-    return _emitters(_uniform(count, half_size(size), _range(depth_range), seed).T, 1)
-
-
-def beads(
-    count: int,
-    size: Sequence[Number],
-    depth_range: Sequence[Number],
-    *,
-    diameter: Number = 0.005,
-    pitch: Number,
-    seed: int = 0,
-) -> Emitters:
-    """Fluorescent balls at random in a slab, as those in PDMS of Fig. 7 (5 um, in 2.5 mm), which clump there.
-
-    Balls lie wholly inside and may overlap. Each is filled with a cubic lattice of emitters.
-
-    Parameters
-    ----------
-    count, seed
-        Number of balls, and the seed of their positions.
-    size, depth_range
-        `(x, y)` of the slab, its middle on the axis, and its `(near, far)` sides, mm.
-    diameter, pitch
-        Of a ball, and the spacing of its emitters, mm.
-    """
-    _check_lengths(diameter=diameter, pitch=pitch)
-    half, (near, far), radius = half_size(size), _range(depth_range), diameter / 2
-    if diameter > (room := min(*(2 * half), far - near)):
-        raise InputError(f"`diameter` must be at most {room:.4g} mm to fit into the slab, got {diameter}.")
-    middles = _uniform(count, half - radius, (near + radius, far - radius), seed)
-    ball = np.array(list(product(_cells(-radius, radius, pitch)[0], repeat=3)))
-    ball = ball[(ball**2).sum(axis=1) <= radius**2]
-    return _emitters((middles[:, None] + ball).reshape(-1, 3).T, math.pi * diameter**3 / 6 / len(ball))
-
-
-def usaf_bars(groups: Sequence[int] = (2, 3)) -> Float[np.ndarray, "bar 4"]:
-    """Bars of the 1951 USAF target (MIL-STD-150A): rows of `(x_min, x_max, y_min, y_max)`, mm.
-
-    Element `e` of group `g` has `2^(g + (e - 1) / 6)` line pairs per mm: three bars across x, then three across y, five
-    times as long as wide, as far apart as wide. The arrangement is ours: each group is a column of six elements, the
-    first at the top (the least y), columns go from left to right, and the middle of the whole is on the axis.
-    """
-    if len(groups) == 0:
-        raise InputError("`groups` must be one group or more, got none.")
-    elements, left = [], 0.0
-    for group in groups:
-        widths = 0.5 / 2.0 ** (group + np.arange(6) / 6)
-        tops = 7 * (np.cumsum(widths) - widths)
-        elements += [width * _ELEMENT + [left, left, top, top] for width, top in zip(widths, tops, strict=True)]
-        left += 15 * widths[0]
-    bars = np.concatenate(elements)
-    middle = (bars[:, [0, 2]].min(axis=0) + bars[:, [1, 3]].max(axis=0)) / 2
-    return bars - np.repeat(middle, 2)
-
-
-def usaf_1951(groups: Sequence[int] = (2, 3), *, depth: Number, pitch: Number) -> Emitters:
-    """The bars of `usaf_bars`, glowing, in the plane `depth` (Fig. 6)."""
-    _check_lengths(depth=depth, pitch=pitch)
-    cells = [(_cells(a, b, pitch), _cells(c, d, pitch)) for a, b, c, d in usaf_bars(groups)]
-    grids = [(np.tile(x, len(y)), np.repeat(y, len(x)), dx * dy) for (x, dx), (y, dy) in cells]
-    return np.concatenate([_emitters([x, y, depth], area) for x, y, area in grids])
-
-
-def snowflake(
-    depth_range: Sequence[Number] = (20.0, 25.0),
-    size: Number = 20.0,
-    tilt: Number = 0.0,
-    *,
-    width: Number = 0.7,
-    pitch: Number,
-) -> Emitters:
-    """A flat six-armed snowflake, inclined so that it just spans a range of depths, as that of Fig. 8.
-
-    An arm is a line with two pairs of branches at 60 degrees, its ends round. The paper gives the width of its features
-    and the depths; the rest is ours.
-
-    Parameters
-    ----------
-    depth_range
-        `(near, far)` of the outline, mm; emitters on it stand out half a pitch. The same twice: not inclined.
-    size, width, pitch
-        From tip to tip, of its lines, and the spacing of its emitters, mm. The size is at least 14 widths.
-    tilt
-        The direction toward which it becomes deeper, radians from +x (along an arm) to +y.
-    """
-    near, far = _range(depth_range)
-    _check_lengths(size=size, width=width, pitch=pitch)
-    if size < 14 * width:
-        raise InputError(f"`size` must be at least 14 widths, {14 * width:.4g} mm, got {size}.")
-    # Points of the plane as x + iy: a product with exp(i a) turns by a.
-    arm, turns, along = _ARM * (size - width) / 2, np.exp(1j * np.pi / 3 * np.arange(6)), np.exp(1j * tilt)
-    reach = float(np.real(np.multiply.outer(turns, arm) / along).max()) + width / 2
-    if (sine := (far - near) / (2 * reach)) > 1:
-        raise InputError(f"`depth_range` must span at most {2 * reach:.4g} mm for that size, got {far - near:.4g}.")
-    sixth, area = _filled_sixth(arm, width, pitch)
-    flat = np.multiply.outer(turns, sixth).ravel()
-    slope = np.real(flat / along)
-    lateral = flat - (1 - math.sqrt(1 - sine**2)) * slope * along
-    return _emitters([lateral.real, lateral.imag, (near + far) / 2 + sine * slope], np.tile(area, 6))
+    return as_emitters(uniform_points(count, half_size(size), check_range(depth_range), seed).T, 1)
 
 
 def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitters:
@@ -141,7 +38,8 @@ def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitt
 
     In Pillow's own font, with capitals of a `height`, in the plane `depth`, mm.
     """
-    _check_lengths(depth=depth, height=height, pitch=pitch)
+    for name, length in (("depth", depth), ("height", height), ("pitch", pitch)):
+        check_positive(name, length)
     rows = math.ceil(height / pitch)
     parts = math.ceil(_LEAST_ROWS / rows)
     ink = _render_text(text, rows * parts * 1000 / len(_render_text("H", 1000)))
@@ -151,7 +49,7 @@ def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitt
     covered = padded.reshape(len(padded) // parts, parts, -1, parts).mean(axis=(1, 3))
     row, column = np.nonzero(covered)
     y, x = (square * (at + 0.5 - n / (2 * parts)) for at, n in zip((row, column), ink.shape, strict=True))
-    return _emitters([x, y, depth], covered[row, column] * square**2)
+    return as_emitters([x, y, depth], covered[row, column] * square**2)
 
 
 def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> Float[Array, "depth y x"]:
@@ -226,44 +124,23 @@ def _shares(index, size):
     return (below, inside * (1 - fraction)), (below + 1, inside * fraction)
 
 
-def _check_lengths(**lengths):
-    for name, length in lengths.items():
-        check_positive(name, length)
-
-
-def _range(depth_range) -> tuple[float, float]:
+def check_range(depth_range) -> tuple[float, float]:
+    """The depths `(near, far)`, mm, as floats; `InputError` unless they are positive and ascend."""
     if len(depth_range) != 2 or not 0 < depth_range[0] <= depth_range[1] < math.inf:
         raise InputError(f"`depth_range` must be (near, far), positive and ascending, mm, got {tuple(depth_range)}.")
     return float(depth_range[0]), float(depth_range[1])
 
 
-def _uniform(count, half, depth_range, seed):
+def uniform_points(count, half, depth_range, seed):
+    """Random points `(point, 3)` of a box from `-half` to `half` (x, y), and of a range of depths."""
     if count < 1:
         raise InputError(f"`count` must be 1 or more, got {count}.")
     return np.random.default_rng(seed).uniform([*-half, depth_range[0]], [*half, depth_range[1]], (count, 3))
 
 
-def _emitters(xyz, intensity) -> Emitters:
+def as_emitters(xyz, intensity) -> Emitters:
+    """Emitters of coordinates and intensities that broadcast."""
     return np.stack(np.broadcast_arrays(*xyz, intensity), axis=1, dtype=float)
-
-
-def _cells(start, end, pitch):
-    """Middles and length of the fewest equal parts of an interval that are no longer than `pitch`."""
-    count = math.ceil((end - start) / pitch * (1 - 1e-9))
-    step = (end - start) / count
-    return start + (np.arange(count) + 0.5) * step, step
-
-
-def _filled_sixth(arm, width, pitch):
-    """Square lattice over the arm in its sector, 30 degrees to both sides, and the covered area of each square."""
-    count = math.ceil((arm.real.max() + width) / pitch)
-    x, y = (np.arange(count) + 0.5) * pitch, (np.arange(-count, count) + 0.5) * pitch
-    points = (x + 1j * y[:, None]).ravel()
-    points = points[np.abs(points.imag) < math.tan(math.pi / 6) * points.real]
-    steps = [(points - start, end - start) for start, end in arm]
-    distances = [np.abs(step - line * np.clip((step / line).real, 0, 1)) for step, line in steps]
-    covered = np.clip((width / 2 - np.min(distances, axis=0)) / pitch + 0.5, 0, 1)
-    return points[covered > 0], covered[covered > 0] * pitch**2
 
 
 def _render_text(text, font_size):
