@@ -91,8 +91,10 @@ def _from_json(path: Path) -> dict:
     return data.get(KEY, {}) if isinstance(data, dict) else {}
 
 
-def _from_json_if_there(path: Path) -> dict:
-    return _from_json(path) if path.exists() else {}
+def _from_sidecar(path: Path) -> dict:
+    # The second name is that of older versions.
+    names = [sidecar(path), *([path.with_suffix(".json")] if path.suffix.lower() == ".stl" else ())]
+    return next((table for name in names if name.exists() and (table := _from_json(name))), {})
 
 
 def _from_tiff(path: Path) -> dict:
@@ -115,7 +117,7 @@ def _from_png(path: Path) -> dict:
 def _from_zarr(path: Path) -> dict:
     if (path / "zarr.json").exists():
         return json.loads(read_text(path / "zarr.json")).get("attributes", {}).get(KEY, {})
-    return _from_json_if_there(path / ".zattrs")
+    return _from_json(path / ".zattrs") if (path / ".zattrs").exists() else {}
 
 
 def _from_weights(path: Path) -> dict:
@@ -140,13 +142,8 @@ _READERS: dict[str, Callable[[Path], dict]] = {
     ".toml": lambda path: tomllib.loads(read_text(path)).get(KEY, {}),
     ".npz": _from_weights,
     ".3mf": _from_3mf,
-    # The second name is that of older versions.
-    ".stl": lambda path: _from_json_if_there(sidecar(path)) or _from_json_if_there(path.with_suffix(".json")),
     ".json": _from_json,
-    **dict.fromkeys(
-        (".npy", ".csv", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"),
-        lambda path: _from_json_if_there(sidecar(path)),
-    ),
+    **dict.fromkeys((".npy", ".csv", ".stl", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"), _from_sidecar),
 }
 
 

@@ -18,7 +18,7 @@ import tifffile
 from PIL import Image, UnidentifiedImageError
 
 from ..base.errors import InputError, InputWarning, input_error
-from .axes import UNNAMED, OmePlanes, axis_letter, is_ome, read_ndtiff, read_ome
+from .axes import UNNAMED, axis_letter, is_ome, read_ndtiff, read_ome
 from .files import decoding
 from .names import natural_order
 
@@ -75,7 +75,7 @@ class Tiff:
             return stack
         if indexed := read_ndtiff(self.path):
             return self._of_set(*indexed)
-        pages = [page for page in range(self.count) if not self._is_reduced(page)]
+        pages = self._full_pages()
         declared = math.prod(length for _, length in self._axes)
         if declared <= len(pages):
             self._warn_if_cut(len(pages))
@@ -97,6 +97,7 @@ class Tiff:
         return self._others[path], page
 
     def _ome_stack(self) -> Stack | None:
+        """The images that OME-XML declares; None if it is damaged and the file has a single page."""
         try:
             images = read_ome(self.path, self.first.description, self.count)
         except InputError:
@@ -106,17 +107,14 @@ class Tiff:
             return None
         if not images and self.count > 1:
             raise input_error("OME-XML", f"about the file's {self.count} pages", "none of them", self.path)
-        if len(images) > 1:
-            every = [image for each in images for image in each.planes]
-            return Stack([("image", len(images)), *images[0].lengths.items()], every)
-        return self._of_ome(images[0]) if images else None
-
-    def _of_ome(self, ome: OmePlanes) -> Stack:
-        size = self.first.imagelength, self.first.imagewidth
-        if ome.size != size:
-            given = "{} x {} pixels in OME-XML".format(*ome.size)
+        if len(images) != 1:
+            planes = [plane for image in images for plane in image.planes]
+            return Stack([("image", len(images)), *images[0].lengths.items()], planes) if images else None
+        size, (lengths, declared, planes) = (self.first.imagelength, self.first.imagewidth), images[0]
+        if declared != size:
+            given = "{} x {} pixels in OME-XML".format(*declared)
             raise input_error("image", "{} x {} pixels, as its page".format(*size), given, self.path)
-        return self._of_set(list(ome.lengths.items()), ome.planes)
+        return self._of_set(list(lengths.items()), planes)
 
     def _of_set(self, axes, images: list[tuple[Path, int] | None]) -> Stack:
         """A stack of images in this file and others, some of which may not be there."""
@@ -166,17 +164,12 @@ class Tiff:
             axes = [("file", 1 + len(others)), *stack.axes]
         return Stack(axes, images)
 
-    def _is_reduced(self, page: int) -> bool:
-        """Whether a page is a smaller copy of another, or its mask; the second tells whether there are any."""
-        if self.entries == 1 or not self._has_reduced:
-            return False
+    def _full_pages(self) -> list[int]:
+        """Pages that are no smaller copies of others, nor masks; the second page tells whether there are any."""
         with decoding(self.path, "TIFF"):
-            return page > 0 and bool(self.file.pages[page].aspage().subfiletype & 0b101)
-
-    @cached_property
-    def _has_reduced(self) -> bool:
-        with decoding(self.path, "TIFF"):
-            return bool(self.file.pages[1].aspage().subfiletype & 0b101)
+            is_full = lambda page: not self.file.pages[page].aspage().subfiletype & 0b101
+            has_reduced = self.entries > 1 and not is_full(1)
+            return [page for page in range(self.count) if not page or not has_reduced or is_full(page)]
 
     def check_alone(self) -> None:
         """Raise `InputError` if a file of one page had more, and is cut off; other files of its set do not matter."""
