@@ -18,7 +18,7 @@ import click
 from ._version import __version__
 from .base.errors import InputError, InputWarning
 from .base.progress import QUIET, VERBOSE, verbosity
-from .cli.outputs import ARGUMENTS, exit_now, exit_on_signal, exit_status, interrupt_message, partial_outputs
+from .cli.command import ARGUMENTS, exit_now, exit_on_signal, exit_status, interrupt_message, partial_outputs
 
 # Longer messages are cut: their ends matter least.
 _MAX_MESSAGE = 380

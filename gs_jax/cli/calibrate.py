@@ -7,9 +7,9 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, side_file
+from .command import check_may_write, force_option, provenance_of
 from .light import Light, ask_for_unit, light_options
 from .options import DESIGN, CaptureOptions, capture_options
-from .outputs import check_may_write, force_option, provenance_of
 
 _OF_DEVICE = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
 _NAMES = (*_OF_DEVICE, "sample-at", "sample-index")

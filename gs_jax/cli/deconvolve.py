@@ -7,8 +7,8 @@ import click
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
+from .command import check_even, check_may_write, provenance_of
 from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, given_options, picture_options
-from .outputs import check_even, check_may_write, provenance_of
 
 _METHODS = ("admm", "fista", "richardson-lucy", "wiener")
 # Options of the methods that take steps.

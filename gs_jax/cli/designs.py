@@ -8,9 +8,9 @@ import click
 
 from ..base.errors import InputError
 from ..io.files import check_output, write_json
+from .command import check_may_write, force_option, provenance_of
 from .light import Light, check_beyond, objects_in, sample_options
 from .options import DESIGN, MM, UM, Depths, shipped_designs
-from .outputs import check_may_write, force_option, provenance_of
 
 
 @click.command("layout", epilog="Example: gs-jax layout --count 200 --size-mm 20 20 --pitch-mm 1.23 -o centers.csv")

@@ -10,9 +10,9 @@ from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, side_file, write_json
+from .command import check_may_write, force_option, provenance_of
 from .light import Light, check_beyond, objects_in, sample_options
 from .options import DESIGN, UM, Depths, Number, given_options
-from .outputs import check_may_write, force_option, provenance_of
 
 SMALL_UM, FEATURE_UM = Number(1e-3, 1e3, "um"), Number(1e-2, 1e3, "um")
 PERCENT, DRAFT, HEADROOM = Number(0.0, 20.0, "%"), Number(0.0, 30.0, "degrees"), Number(0.0, 100.0, "mm")

@@ -10,8 +10,8 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..io.files import check_output
+from .command import check_may_write, force_option, provenance_of
 from .options import given_options
-from .outputs import check_may_write, force_option, provenance_of
 
 # Table of each option that is a key of the file, in the order of the questions.
 _TABLES = {

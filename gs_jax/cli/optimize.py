@@ -8,8 +8,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output, checkpoint_path, make_folder, write_json
+from .command import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 from .options import DESIGN, terms_option, worker_options
-from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
 
 @click.command("optimize", epilog="Example: gs-jax optimize design/geomscope.toml --study study.toml -o new.toml")

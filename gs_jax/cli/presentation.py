@@ -8,9 +8,9 @@ import click
 from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
+from .command import PARTIAL, check_may_write, partial_outputs, provenance_of
 from .light import Light, objects_in, sample_options
 from .options import CAPTURE_OPTIONS, DESIGN, CaptureOptions, capture_options, given_options, terms_option
-from .outputs import PARTIAL, check_may_write, partial_outputs, provenance_of
 
 
 @click.command(

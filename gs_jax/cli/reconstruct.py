@@ -11,6 +11,7 @@ from ..base.errors import InputError, needs_extra
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output
+from .command import check_even, check_may_write, force_option, provenance_of
 from .light import Light, light_options, objects_in
 from .options import (
     DESIGN,
@@ -25,8 +26,7 @@ from .options import (
     depth_range,
     worker_options,
 )
-from .outputs import check_even, check_may_write, force_option, provenance_of
-from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
+from .recordings import check_recording, reconstruct_recording, recording_options, residual_in_words
 from .watch_command import check_watched, watch_folder
 
 

@@ -8,9 +8,9 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
+from .command import check_may_write, provenance_of
 from .light import Light, ask_for_unit, check_beyond, light_options, objects_in
 from .options import DESIGN, PSFS, SIMULATED, Number, given_options
-from .outputs import check_may_write, provenance_of
 
 PEAK = Number(1.0, 1e6, "electrons")
 ELECTRONS = Number(0.0, 1e9, "electrons")

@@ -10,6 +10,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output, checkpoint_path, side_file, write_json
+from .command import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 from .light import LIGHT_OPTIONS, Light, check_beyond, sample_options
 from .options import (
     CAPTURE_OPTIONS,
@@ -21,7 +22,6 @@ from .options import (
     given_options,
     worker_options,
 )
-from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
 # Steps of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1400}

@@ -11,10 +11,10 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from .command import RESUMABLE, partial_outputs, provenance_of
 from .light import objects_in
 from .options import CaptureOptions
-from .outputs import RESUMABLE, partial_outputs, provenance_of
-from .recording_command import MAX_NAMED, frames_of, print_notes, request_of, write_series_points
+from .recordings import MAX_NAMED, frames_of, print_notes, request_of, write_series_points
 
 # The table of points is written again after this multiple of the time that it took last, and seconds at least.
 _SHARE, _PAUSE = 20, 1.0

@@ -14,9 +14,9 @@ import click
 from ..base.errors import InputError, InputWarning
 from ..base.progress import Progress
 from ..base.workers import Workers
+from .command import RESUMABLE, partial_outputs, provenance_of
 from .light import objects_in
 from .options import UM, CaptureOptions, Number, depth_range
-from .outputs import RESUMABLE, partial_outputs, provenance_of
 
 # Failed frames that are named; others are only counted, and listed in the journal.
 MAX_NAMED = 10
