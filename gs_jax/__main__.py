@@ -1,24 +1,28 @@
-"""The command line: runs a command, and turns errors into one line and an exit status.
+"""The command line: runs a command, and turns errors and signals into one line and an exit status.
 
 The exit status is 0 on success; 2 on wrong input, 1 if a file cannot be read or written, 130 on Ctrl-C and 143 on
-SIGTERM, each with one line and no traceback; 1, with a traceback, on faults of the program.
+SIGTERM, each with one line and no traceback; 1, with a traceback, on faults of the program. A signal ends a command
+soon, even within compiled code, and leaves no half-written file.
 """
 
 import io
+import multiprocessing
+import os
+import signal
+import socket
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import wraps
 from importlib import import_module
-from typing import Any
 
 import click
 
 from ._version import __version__
 from .base.errors import InputError, InputWarning
-from .base.progress import QUIET, VERBOSE, verbosity
-from .cli.command import ARGUMENTS, exit_now, exit_on_signal, exit_status, interrupt_message, partial_outputs
+from .cli.command import ARGUMENTS, partial_outputs
+from .io.files import remove_temporaries
 
 # Longer messages are cut: their ends matter least.
 _MAX_MESSAGE = 380
@@ -31,8 +35,8 @@ COMMANDS = {
     "metrics": "designs",
     "new-design": "new_design",
     "layout": "designs",
-    "optimize": "optimize",
-    "pareto": "optimize",
+    "optimize": "designs",
+    "pareto": "designs",
     "tolerance": "fabrication",
     "benchmark": "presentation",
     "mold": "fabrication",
@@ -95,39 +99,7 @@ class _Commands(click.Group):
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f".cli.{COMMANDS[cmd_name]}", __package__)
-        command = getattr(module, f"{cmd_name.replace('-', '_')}_command")
-        if not any(param.name == "quiet" for param in command.params):
-            command.params += _LEVELS
-            command.callback = _with_platforms(command.callback)
-        return command
-
-
-def _with_platforms(callback: Any) -> Any:
-    """A command that first looks whether JAX can run; its help does without JAX."""
-
-    @wraps(callback)
-    def call(*arguments, **options):
-        from .base.machine import check_platforms
-
-        check_platforms()
-        return callback(*arguments, **options)
-
-    return call
-
-
-def _set_level(context: click.Context, param: click.Parameter, value: bool) -> None:
-    if value:
-        token = verbosity.set(QUIET if param.name == "quiet" else VERBOSE)
-        context.call_on_close(lambda: verbosity.reset(token))
-
-
-_LEVELS = [
-    click.Option(names, is_flag=True, expose_value=False, callback=_set_level, help=text)
-    for names, text in (
-        (["-q", "--quiet"], "Show no progress and no replaced files."),
-        (["-v", "--verbose"], "Print the duration of each step."),
-    )
-]
+        return getattr(module, f"{cmd_name.replace('-', '_')}_command")
 
 
 @contextmanager
@@ -161,6 +133,91 @@ def commands():
     context.with_resource(_print_warnings_once())
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
+
+
+# Seconds that Python has after a signal to end by itself, to close files and print its last lines.
+PATIENCE = 1.0
+# Exit statuses of commands that a signal ended begin here, as in shells.
+_BY_SIGNAL = 128
+
+
+class Terminated(KeyboardInterrupt):
+    """Raised by SIGTERM, as `KeyboardInterrupt` by Ctrl-C."""
+
+
+def exit_status(interrupt: BaseException | None) -> int:
+    """130 for Ctrl-C, 143 for SIGTERM."""
+    return _BY_SIGNAL + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
+
+
+def interrupt_message() -> str:
+    """The last line of an interrupted command."""
+    existing = [f"{path} {text}" for path, text in partial_outputs.items() if path.exists()]
+    return f"gs-jax: {'; '.join(['interrupted', *existing])}"
+
+
+@contextmanager
+def exit_on_signal() -> Iterator[None]:
+    """Within it, a signal raises an exception, and ends the process if that has not done so within `PATIENCE`.
+
+    Compiled code may return to Python only minutes later, and no exception is raised before. Only the main thread may
+    enter it.
+    """
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    wakeup = signal.set_wakeup_fd(theirs.fileno())
+    # A background process may ignore Ctrl-C, and continues to.
+    heard = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
+    handlers = {number: signal.signal(number, _interrupt) for number in heard}
+    hook, sys.unraisablehook = sys.unraisablehook, _unraisable
+    threading.Thread(target=_watch, args=(ours,), daemon=True).start()
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(wakeup)
+        theirs.close()
+
+
+def exit_now(status: int) -> None:
+    """End the process without shutting the interpreter down, which may crash under running compiled code."""
+    remove_temporaries()
+    for child in multiprocessing.active_children():
+        child.terminate()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
+
+
+def _interrupt(number, frame):
+    """Raise an exception; but one within the initialisation of an extension may crash it: then end the process."""
+    while frame:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            # Nothing has been written that early.
+            print(interrupt_message(), file=sys.stderr)
+            exit_now(_BY_SIGNAL + number)
+        frame = frame.f_back
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+
+def _unraisable(unraisable):
+    # An interrupt within a garbage collector's callback is lost; `_watch` ends the process.
+    if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
+        sys.__unraisablehook__(unraisable)
+
+
+def _watch(ours):
+    with ours:
+        while number := ours.recv(1):
+            if number[0] in (signal.SIGINT, signal.SIGTERM):
+                break
+        else:
+            return
+    threading.Event().wait(PATIENCE)
+    print(f"\n{interrupt_message()}", file=sys.stderr)
+    exit_now(_BY_SIGNAL + number[0])
 
 
 if __name__ == "__main__":

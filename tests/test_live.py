@@ -13,7 +13,7 @@ import pytest
 import tifffile
 
 from gs_jax import Grid, InputError
-from gs_jax.cli.watch_command import _State
+from gs_jax.cli.recordings import _State
 from gs_jax.io.captures import read_capture
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, check_replaceable, read_series
 from gs_jax.io.watched_folder import WatchedFolder

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from gs_jax.__main__ import COMMANDS, commands
+from gs_jax.__main__ import COMMANDS, commands, interrupt_message
 from gs_jax.cli import options
-from gs_jax.cli.command import RESUMABLE, interrupt_message
+from gs_jax.cli.command import RESUMABLE
 from gs_jax.cli.deconvolve import deconvolve_command
 from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
@@ -194,7 +194,7 @@ def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
 
 
 def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr("gs_jax.cli.command.partial_outputs", {tmp_path / "w.checkpoint": RESUMABLE})
+    monkeypatch.setattr("gs_jax.__main__.partial_outputs", {tmp_path / "w.checkpoint": RESUMABLE})
     assert interrupt_message() == "gs-jax: interrupted"
     (tmp_path / "w.checkpoint").touch()
     assert interrupt_message().endswith("w.checkpoint has what is done, and --resume goes on from it")
@@ -283,7 +283,7 @@ def test_what_is_being_written_is_removed_with_the_process(tmp_path):
 
 IMPORTING = f"""
 {HEARD}
-from gs_jax.cli.command import exit_on_signal
+from gs_jax.__main__ import exit_on_signal
 with exit_on_signal():
     try:
         import slow_extension

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
-from gs_jax.cli.optimize import optimize_command as optimize, pareto_command as pareto
+from gs_jax.cli.designs import optimize_command as optimize, pareto_command as pareto
 from gs_jax.codesign import terms
 from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope

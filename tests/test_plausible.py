@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gs_jax.base.errors import InputError, InputWarning
-from gs_jax.cli.light import ask_for_unit
-from gs_jax.cli.options import shipped_designs
+from gs_jax.cli.options import ask_for_unit, shipped_designs
 from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope
 from gs_jax.design.validation import USUAL, slip

@@ -1,18 +1,19 @@
 """`gs-jax calibrate`: the geometry of a real microscope, from captures of point sources."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, side_file
-from .command import check_may_write, force_option, provenance_of
-from .light import Light, ask_for_unit, light_options
-from .options import DESIGN, CaptureOptions, capture_options
+from .command import check_may_write, command, provenance_of
+from .options import CaptureOptions, DepthLight, DesignPath, ask_for_unit
 
-_OF_DEVICE = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
-_NAMES = (*_OF_DEVICE, "sample-at", "sample-index")
+# Names of quantities, of which the first four are always fitted.
+NAMES = "sensor-distance rotation shift tilt scale depth-offset lenses sample-at sample-index".split()
 # Depth of the source of a pattern unless --positions says another, mm: 10 m.
 _FAR = 1e4
 
@@ -26,60 +27,29 @@ class _Names(click.ParamType):
         if isinstance(value, tuple):
             return value
         names = tuple(name.strip().replace("_", "-") for name in value.split(","))
-        if wrong := [name for name in names if name not in _NAMES]:
-            self.fail(f"must be some of {', '.join(_NAMES)}, got {wrong[0]!r}.", param, ctx)
+        if wrong := [name for name in names if name not in NAMES]:
+            self.fail(f"must be some of {', '.join(NAMES)}, got {wrong[0]!r}.", param, ctx)
         return tuple(name.replace("-", "_") for name in names)
 
 
-@click.command("calibrate", epilog="Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")
-@click.argument("design", type=DESIGN)
-@click.argument("captures", type=Path, nargs=-1)
-@click.option(
-    "--positions",
-    type=Path,
-    help="POINTS.csv: x_mm,y_mm,z_mm of the source in each capture, one line each; with several sources per capture, "
-    "a first column `capture` (number or file name). Empty cells are unknown and are fitted.",
-)
-@click.option(
-    "--fit",
-    type=_Names(),
-    default=(),
-    help=f"Also fit these: {', '.join(_NAMES[4:])}. {', '.join(_NAMES[:4])} are always fitted.",
-)
-@click.option("--hold", type=_Names(), default=(), help="Take these from the design and do not fit them.")
-@click.option("--find-lenses", is_flag=True, help="Find the lenses instead of using DESIGN's; needs --positions.")
-@click.option(
-    "--from-scene", is_flag=True, help="Fit rotation and tilt to one capture of any sparse scene, without positions."
-)
-@click.option(
-    "--pattern",
-    type=Path,
-    help="Capture with one image of every lens, sharp or not: of a far source, or of an even white surface. Alone, it "
-    "fits rotation, shift and scale of the lenses' pattern; with CAPTURES, scale beside the rest.",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=Path,
-    required=True,
-    help="CALIBRATED.toml; a picture of the residuals, CALIBRATED.toml.png, is written beside it.",
-)
-@light_options
-@capture_options
-@force_option
+Names = Annotated[tuple[str, ...], _Names()]
+
+
+@command("calibrate", "Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")
 def calibrate_command(
-    design: Path,
-    captures: tuple[Path, ...],
-    positions: Path | None,
-    fit: tuple[str, ...],
-    hold: tuple[str, ...],
-    find_lenses: bool,
-    from_scene: bool,
-    pattern: Path | None,
+    design: DesignPath,
+    captures: tuple[Path, ...] = (),
+    *,
+    positions: Path | None = None,
+    fit: Names = (),
+    hold: Names = (),
+    find_lenses: bool = False,
+    from_scene: bool = False,
+    pattern: Path | None = None,
     output: Path,
-    force: bool,
-    light: Light,
+    light: DepthLight,
     camera: CaptureOptions,
+    force: bool = False,
 ):
     """Find the geometry of a real microscope, from CAPTURES of a pinhole or bead at known positions.
 
@@ -96,6 +66,19 @@ def calibrate_command(
     sample` for DESIGN's [sample]) or a number of the sample is fitted; a scene is in DESIGN's [sample]. Points of known
     depths in a sample show where it begins and its index: --fit sample-at,sample-index, with --hold
     sensor-distance,rotation,shift,tilt. Those of a scene that nobody knows hardly show.
+
+    Options:
+        positions: POINTS.csv: x_mm,y_mm,z_mm of the source in each capture, one line each; with several sources per
+            capture, a first column `capture` (number or file name). Empty cells are unknown and are fitted.
+        fit: Also fit these: scale, depth-offset, lenses, sample-at, sample-index. sensor-distance, rotation, shift,
+            tilt are always fitted.
+        hold: Take these from the design and do not fit them.
+        find_lenses: Find the lenses instead of using DESIGN's; needs --positions.
+        from_scene: Fit rotation and tilt to one capture of any sparse scene, without positions.
+        pattern: Capture with one image of every lens, sharp or not: of a far source, or of an even white surface.
+            Alone, it fits rotation, shift and scale of the lenses' pattern; with CAPTURES, scale beside the rest.
+        output: CALIBRATED.toml; a picture of the residuals, CALIBRATED.toml.png, is written beside it.
+        force: Replace existing .toml and .csv files.
     """
     import numpy as np
     from rich.console import Console
@@ -135,23 +118,25 @@ def calibrate_command(
             capture = next(iter(captures))
             image = camera.read(capture)
             camera.print_corrections()
-            grid = voxel_grid(imager, list(light.working_distance(microscope, imager)))
+            near, far = microscope.imaging.working_distance_mm
+            grid = voxel_grid(imager, [max(near, float(str(imager.sample_surface))), far])
             with errors_name_file(capture):
                 outcome = self_calibrate(image, imager, grid, fit=names, progress=progress)
         else:
-            points, of = read_positions(positions, pictures) if positions else (np.zeros((0, 3)), np.zeros(0, int))
+            points, numbers = read_positions(positions, pictures) if positions else (np.zeros((0, 3)), np.zeros(0, int))
             ask_for_unit(positions, points)
             points[:, 2] += light.origin(imager) or 0.0
             blurred = [len(captures)] if pattern else []
-            if pattern and len(captures) not in of:
+            if pattern and len(captures) not in numbers:
                 # A far source shows the array's shift unless others do: then its own direction is fitted.
                 aside = np.nan if captures else 0.0
-                points, of = np.append(points, [[aside, aside, _FAR]], 0), np.append(of, len(captures))
+                points = np.append(points, [[aside, aside, _FAR]], 0)
+                numbers = np.append(numbers, len(captures))
             with errors_name_file(positions or pattern or design):
-                Sources(points, of).check(len(pictures), imager, names, blurred)
+                Sources(points, numbers).check(len(pictures), imager, names, blurred)
             images = [camera.read(path) for path in progress.track(pictures, "Reading captures")]
             camera.print_corrections()
-            options = {"captures": of, "fit": names, "find_lenses": find_lenses, "blurred": blurred}
+            options = {"captures": numbers, "fit": names, "find_lenses": find_lenses, "blurred": blurred}
             try:
                 outcome = calibrate(images, points, imager, **options, progress=progress)
             except MisfitError as error:
@@ -174,13 +159,13 @@ def _print_fits(pictures, fits) -> None:
         click.echo(f"{path.name}: {fit}")
 
 
-def _with_sample(light: Light, design, default: str) -> Light:
-    """The light with the sample that is meant; "sample" is the design's `[sample]`, if no other has this name."""
-    name = light.sample or (default if light.refractive_index is None else None)
-    return light._replace(sample=None if name == "sample" and name not in design.samples else name)
+def _with_sample(light: DepthLight, design, default: str) -> DepthLight:
+    """The light with its sample by name; "sample" is the design's `[sample]`, if no other has this name."""
+    name = light.sample or (default if light.sample_index is None else None)
+    return replace(light, sample=None if name == "sample" and name not in design.samples else name)
 
 
-def _other_samples(light: Light, design) -> str:
+def _other_samples(light: DepthLight, design) -> str:
     """The names of a design's samples, if the sources are taken to be in air."""
     from ..design.conversion import AIR, NO_SAMPLE, default_sample
 

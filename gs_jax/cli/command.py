@@ -1,32 +1,143 @@
-"""A command's outputs: checks before it starts, provenance, and what SIGINT or SIGTERM leaves of them.
+"""Commands from functions: options from signatures, help from docstrings; checks of outputs, and provenance."""
 
-A signal ends a command soon, even within compiled code, and leaves no half-written file.
-"""
-
-import itertools
-import multiprocessing
+import inspect
 import os
+import re
 import shlex
-import signal
-import socket
 import sys
-import threading
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import wraps
 from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import click
+from click.core import ParameterSource
 
-from ..base.errors import InputError, input_error
-from ..base.progress import QUIET, verbosity
-from ..io.files import remove_temporaries
+from ..base.errors import InputError
+from ..base.progress import QUIET, VERBOSE, verbosity
 
 # Files that people write by hand: designs, studies, points and centres.
 _WRITTEN_BY_HAND = (".toml", ".csv")
 # Key of the command line in click's `meta`.
 ARGUMENTS = "gs_jax.arguments"
+# Files to name after an interrupt, with a text about each.
+partial_outputs: dict[Path, str] = {}
+RESUMABLE, PARTIAL = "has what is done, and --resume goes on from it", "has what is done"
 
-force_option = click.option("--force", is_flag=True, help="Replace existing .toml and .csv files.")
+
+class OptionGroup:
+    """Base of classes whose arguments are options of every command that has a parameter of the class."""
+
+
+def command(
+    name: str, epilog: str, more: Sequence[click.Option] = ()
+) -> Callable[[Callable[..., object]], click.Command]:
+    """Make a command of a function.
+
+    Parameters before `*` become arguments, those after it options, which are required without a default. A `bool`
+    becomes a flag, a parameter of an `OptionGroup` the options of that class. `Annotated` may hold a click type, and
+    further names of an option. The docstring is the help, and in its section "Options:" that of each option, as
+    "name: text". Values of the options `more` are further keyword arguments of the function.
+    """
+
+    def decorate(function: Callable[..., object]) -> click.Command:
+        groups = {
+            parameter.name: parameter.annotation
+            for parameter in inspect.signature(function).parameters.values()
+            if _is_group(parameter.annotation)
+        }
+
+        @wraps(function)
+        def callback(**values: Any) -> object:
+            from ..base.machine import check_platforms
+
+            check_platforms()
+            for key, group in groups.items():
+                values[key] = group(**{option: values.pop(option) for option in inspect.signature(group).parameters})
+            return function(**values)
+
+        text, _ = _documentation(function)
+        params = [*_parameters(function), *more, *_LEVELS]
+        return click.Command(name, params=params, callback=callback, help=text, epilog=epilog)
+
+    return decorate
+
+
+def _is_group(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, OptionGroup)
+
+
+def _documentation(documented: Any) -> tuple[str, dict[str, str]]:
+    """Split a docstring into its text and the help of options; classes have the options of their bases too."""
+    bases = documented.__mro__[1:-1] if isinstance(documented, type) else ()
+    texts = {name: text for base in reversed(bases) for name, text in _documentation(base)[1].items()}
+    text, _, section = inspect.cleandoc(documented.__doc__ or "").partition("\nOptions:\n")
+    for name, lines in re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", section, re.MULTILINE):
+        # As click sets the default apart.
+        texts[name] = " ".join(lines.split()).replace(" [default", "  [default")
+    return text, texts
+
+
+def _parameters(documented: Any) -> Iterator[click.Parameter]:
+    """Yield the arguments and options of a function or an `OptionGroup`."""
+    texts = _documentation(documented)[1]
+    for parameter in inspect.signature(documented).parameters.values():
+        if _is_group(parameter.annotation):
+            yield from _parameters(parameter.annotation)
+        elif parameter.kind is parameter.KEYWORD_ONLY or _is_group(documented):
+            yield _option(parameter, texts[parameter.name])
+        elif parameter.kind is not parameter.VAR_KEYWORD:
+            required = parameter.default is parameter.empty
+            yield click.Argument([parameter.name], required=required, **_type(parameter.annotation))
+
+
+def _option(parameter: inspect.Parameter, text: str) -> click.Option:
+    name, settings = f"--{parameter.name.replace('_', '-')}", _type(parameter.annotation)
+    if settings["type"] is bool:
+        settings = {"is_flag": True, "default": parameter.default}
+        name = f"{name}/--no-{name[2:]}" if parameter.default else name
+    elif parameter.default is parameter.empty:
+        settings["required"] = True
+    elif parameter.default is not None:
+        settings["default"] = parameter.default
+    short = ["-o"] if parameter.name == "output" else []
+    further = [part for part in get_args(parameter.annotation) if isinstance(part, str)]
+    return click.Option([parameter.name, *short, name, *further], help=text, **settings)
+
+
+def _type(annotation: Any) -> dict[str, Any]:
+    """Return `type` of an option or argument, and `nargs` if it takes several values."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        types = [part for part in parts[1:] if isinstance(part, click.ParamType)]
+        return {"type": types[0]} if types else _type(parts[0])
+    if origin in (Union, UnionType):
+        return _type(next(part for part in parts if part is not NoneType))
+    if origin is tuple:
+        return _type(parts[0]) | {"nargs": -1 if parts[1] is ... else len(parts)}
+    return {"type": annotation}
+
+
+def _set_level(context: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        token = verbosity.set(QUIET if param.name == "quiet" else VERBOSE)
+        context.call_on_close(lambda: verbosity.reset(token))
+
+
+_LEVELS = [
+    click.Option(names, is_flag=True, expose_value=False, callback=_set_level, help=text)
+    for names, text in (
+        (["-q", "--quiet"], "Show no progress and no replaced files."),
+        (["-v", "--verbose"], "Print the duration of each step."),
+    )
+]
+
+
+def given_options(names: Iterable[str]) -> list[str]:
+    """Those of some options of the running command that its user gave, as `--name`."""
+    source = click.get_current_context().get_parameter_source
+    return [f"--{name.replace('_', '-')}" for name in names if source(name) is ParameterSource.COMMANDLINE]
 
 
 def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force: bool = False) -> None:
@@ -35,12 +146,12 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
     Raises `InputError` if an output is an input, a capture of an input's folder or pattern, another output, or an
     existing .toml or .csv file without `force`.
     """
-    given = [path for path in outputs if path is not None]
-    places = [os.path.realpath(path) for path in given]
-    for path, place in zip(given, places, strict=True):
-        if places.count(place) > 1:
+    paths = [path for path in outputs if path is not None]
+    resolved = [os.path.realpath(path) for path in paths]
+    for path, target in zip(paths, resolved, strict=True):
+        if resolved.count(target) > 1:
             raise InputError(f"{path}: outputs must be different files, got the same file for two.")
-    existing = [path for path in given if os.path.exists(path)]
+    existing = [path for path in paths if os.path.exists(path)]
     if not existing:
         return
     from ..io.recordings import capture_files
@@ -53,16 +164,12 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
         if path.suffix.lower() in _WRITTEN_BY_HAND and not force:
             raise InputError(f"{path}: the output must be a new file, got an existing one; --force replaces it.")
     names, quiet = ", ".join(map(str, existing)), verbosity.get() == QUIET
-    click.get_current_context().call_on_close(lambda: _report_replaced(names, quiet))
 
+    def report() -> None:
+        if sys.exc_info()[0] is None and not quiet:
+            click.echo(f"gs-jax: replaced {names}", err=True)
 
-def check_even(output: Path, depths: list[float] | None) -> None:
-    """Raise `InputError` before the work if a file has one step for all depths, and they are uneven."""
-    if output.suffix.lower() != ".zarr" or not depths or len(depths) < 3:
-        return
-    steps = [after - before for before, after in itertools.pairwise(depths)]
-    if max(steps) - min(steps) > 1e-6 * max(depths):
-        raise input_error("depths", "in even steps for OME-Zarr", "uneven ones; use .ome.tif", output)
+    click.get_current_context().call_on_close(report)
 
 
 def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:
@@ -70,109 +177,15 @@ def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:
     from ..io.provenance import made_by
 
     context = click.get_current_context()
-    command = shlex.join(["gs-jax", *context.meta.get(ARGUMENTS, [context.info_name])])
-    return made_by(command, [path for path in inputs if path is not None], design)
+    arguments = shlex.join(["gs-jax", *context.meta.get(ARGUMENTS, [context.info_name])])
+    return made_by(arguments, [path for path in inputs if path is not None], design)
 
 
-def _report_replaced(names, quiet):
-    if sys.exc_info()[0] is None and not quiet:
-        click.echo(f"gs-jax: replaced {names}", err=True)
+def print_warning(text: str) -> None:
+    """Print a warning, a line on standard error."""
+    click.echo(f"gs-jax: warning: {text}", err=True)
 
 
-# Seconds that Python has to end by itself, to close files and print its last lines.
-PATIENCE = 1.0
-# Exit statuses of commands that a signal ended begin here, as in shells.
-_BY_SIGNAL = 128
-# Files to name after an interrupt, with a text about each.
-partial_outputs: dict[Path, str] = {}
-RESUMABLE, PARTIAL = "has what is done, and --resume goes on from it", "has what is done"
-
-
-class Terminated(KeyboardInterrupt):
-    """Raised by SIGTERM, as `KeyboardInterrupt` by Ctrl-C."""
-
-
-def exit_status(interrupt: BaseException | None) -> int:
-    """130 for Ctrl-C, 143 for SIGTERM."""
-    return _BY_SIGNAL + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
-
-
-def interrupt_message() -> str:
-    """The last line of an interrupted command."""
-    existing = [f"{path} {text}" for path, text in partial_outputs.items() if path.exists()]
-    return f"gs-jax: {'; '.join(['interrupted', *existing])}"
-
-
-@contextmanager
-def exit_on_signal() -> Iterator[None]:
-    """Within it, a signal raises an exception, and ends the process if that has not done so within `PATIENCE`.
-
-    Compiled code may return to Python only minutes later, and no exception is raised before. Only the main thread may
-    enter it.
-    """
-    ours, theirs = socket.socketpair()
-    theirs.setblocking(False)
-    wakeup = signal.set_wakeup_fd(theirs.fileno())
-    # A background process may ignore Ctrl-C, and continues to.
-    replaced = {number: own for number, own in _HANDLERS.items() if signal.getsignal(number) != signal.SIG_IGN}
-    handlers = {number: signal.signal(number, own) for number, own in replaced.items()}
-    hook, sys.unraisablehook = sys.unraisablehook, _unraisable
-    threading.Thread(target=_watch, args=(ours,), daemon=True).start()
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(wakeup)
-        theirs.close()
-
-
-def exit_now(status: int) -> None:
-    """End the process without shutting the interpreter down, which may crash under running compiled code."""
-    remove_temporaries()
-    for child in multiprocessing.active_children():
-        child.terminate()
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    os._exit(status)
-
-
-def _interrupt(number, frame):
-    _exit_if_importing(number, frame)
-    raise KeyboardInterrupt
-
-
-def _terminate(number, frame):
-    _exit_if_importing(number, frame)
-    raise Terminated
-
-
-_HANDLERS = {signal.SIGINT: _interrupt, signal.SIGTERM: _terminate}
-
-
-def _exit_if_importing(number, frame):
-    # An exception within the initialisation of an extension may crash it; nothing has been written that early.
-    while frame:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            print(interrupt_message(), file=sys.stderr)
-            exit_now(_BY_SIGNAL + number)
-        frame = frame.f_back
-
-
-def _unraisable(unraisable):
-    # An interrupt within a garbage collector's callback is lost; `_watch` ends the process.
-    if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
-        sys.__unraisablehook__(unraisable)
-
-
-def _watch(ours):
-    with ours:
-        while number := ours.recv(1):
-            if number[0] in (signal.SIGINT, signal.SIGTERM):
-                break
-        else:
-            return
-    threading.Event().wait(PATIENCE)
-    print(f"\n{interrupt_message()}", file=sys.stderr)
-    exit_now(_BY_SIGNAL + number[0])
+def plural(count: int, noun: str) -> str:
+    """A number of things, such as "2 points"."""
+    return f"{count} {noun}{'s' * (count != 1)}"

@@ -1,94 +1,54 @@
 """`gs-jax deconvolve`: a plane or a volume, from a capture and measured PSFs."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import click
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
-from .command import check_even, check_may_write, provenance_of
-from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, given_options, picture_options
+from .command import OptionGroup, check_may_write, command, given_options, print_warning, provenance_of
+from .options import Binning, Depths, Number, Page, PictureOptions, Steps, Um, check_even, depth_range
 
 _METHODS = ("admm", "fista", "richardson-lucy", "wiener")
 # Options of the methods that take steps.
 _ITERATIVE = ("steps", "stop_at_noise", "psf_places", "tv", "tv_z", "sparsity")
 
 
-@click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf_stack.tif -o volume.ome.tif")
-@click.argument("capture", type=Path)
-@click.argument("psf", type=Path, nargs=-1, required=True)
-@click.option(
-    "--depths",
-    type=Depths(usual=1e5),  # of any mask, whose objects may be metres away
-    help="START:STOP:STEP in mm, STOP included, or a list such as 10,12,40: depths of the planes, in the order of the "
-    "PSFs.  [default: planes are numbered]",
-)
-@click.option("--voxel-um", type=UM, help="What a pixel of CAPTURE is wide in the scene, for scale bars.")
-@click.option(
-    "--method",
-    type=click.Choice(_METHODS),
-    default="admm",
-    show_default=True,
-    help="admm: smooth areas with edges, best for most scenes; fista: separate points; richardson-lucy: dim light, "
-    "where photons are few; wiener: a preview in a second, of one plane.",
-)
-@click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True, help="At most so many steps.")
-@click.option(
-    "--tv",
-    type=Number(0.0, 10.0),
-    help="Weight of total variation (admm, richardson-lucy): the more, the smoother.  [default: admm "
-    "takes the weight that predicts parts of CAPTURE best which are held out]",
-)
-@click.option(
-    "--tv-z",
-    type=Number(0.0, 1000.0),
-    help="How much neighbouring planes are to be alike, relative to neighbouring pixels (admm).  [default: 1]",
-)
-@click.option(
-    "--sparsity", type=Number(0.0, 1.0), help="Weight of the sum of voxels (admm, fista): the more, the darker."
-)
-@click.option("--stop-at-noise", is_flag=True, help="Stop early when all but noise is explained.")
-@click.option(
-    "--psf-page",
-    type=Page(),
-    help="Make one plane of each PSF file: of this page, from 1; or of the mean of repeated frames.  "
-    "[default: a plane for each page]",
-)
-@click.option(
-    "--psf-places",
-    type=Path,
-    help="PLACES.csv, x_mm,y_mm,z_mm, a line for each PSF: of sources all over the field, four or more at each z, if "
-    "the PSF varies over the field.",
-)
-@click.option(
-    "--binning",
-    type=click.IntRange(1, 64),
-    default=1,
-    help="Sum squares of so many pixels a side, of CAPTURE and PSFs alike: 2 takes a quarter of time and memory.",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=Path,
-    required=True,
-    help="VOLUME.ome.tif, .npy, or .zarr (with --depths and --voxel-um), float32, planes of CAPTURE's size.",
-)
-@picture_options
+@dataclass
+class Weights(OptionGroup):
+    """Weights of the methods that take steps.
+
+    Options:
+        tv: Weight of total variation (admm, richardson-lucy): the more, the smoother. [default: admm takes the weight
+            that predicts parts of CAPTURE best which are held out]
+        tv_z: How much neighbouring planes are to be alike, relative to neighbouring pixels (admm). [default: 1]
+        sparsity: Weight of the sum of voxels (admm, fista): the more, the darker.
+    """
+
+    tv: Annotated[float, Number(0.0, 10.0)] | None = None
+    tv_z: Annotated[float, Number(0.0, 1000.0)] | None = None
+    sparsity: Annotated[float, Number(0.0, 1.0)] | None = None
+
+
+@command("deconvolve", "Example: gs-jax deconvolve capture.tif psf_stack.tif -o volume.ome.tif")
 def deconvolve_command(
     capture: Path,
     psf: tuple[Path, ...],
+    *,
+    # Of any mask, whose objects may be metres away.
+    depths: Annotated[list[float], Depths(usual=1e5)] | None = None,
+    voxel_um: Um | None = None,
+    method: Annotated[str, click.Choice(_METHODS)] = "admm",
+    steps: Steps = 100,
+    weights: Weights,
+    stop_at_noise: bool = False,
+    psf_page: Annotated[int | str | None, Page()] = None,
+    psf_places: Path | None = None,
+    binning: Binning = 1,
     output: Path,
-    depths: list[float] | None,
-    voxel_um: float | None,
-    psf_page: int | str | None,
-    psf_places: Path | None,
-    binning: int,
-    method: str,
-    steps: int,
-    stop_at_noise: bool,
-    camera: CaptureOptions,
-    **weights: Any,
+    camera: PictureOptions,
 ):
     """Reconstruct the scene in CAPTURE, taken through a diffuser, a lens array or another mask, from measured PSFs.
 
@@ -110,6 +70,21 @@ def deconvolve_command(
     \b
     A volume from PSFs at 10, 10.5, ... 20 mm, with squares of 2 x 2 pixels summed:
     gs-jax deconvolve capture.tif psfs/ --depths 10:20:0.5 --binning 2 -o volume.ome.tif
+
+    Options:
+        depths: START:STOP:STEP in mm, STOP included, or a list such as 10,12,40: depths of the planes, in the order of
+            the PSFs. [default: planes are numbered]
+        voxel_um: What a pixel of CAPTURE is wide in the scene, for scale bars.
+        method: admm: smooth areas with edges, best for most scenes; fista: separate points; richardson-lucy: dim light,
+            where photons are few; wiener: a preview in a second, of one plane.
+        steps: At most so many steps.
+        stop_at_noise: Stop early when all but noise is explained.
+        psf_page: Make one plane of each PSF file: of this page, from 1; or of the mean of repeated frames.
+            [default: a plane for each page]
+        psf_places: PLACES.csv, x_mm,y_mm,z_mm, a line for each PSF: of sources all over the field, four or more at each
+            z, if the PSF varies over the field.
+        binning: Sum squares of so many pixels a side, of CAPTURE and PSFs alike: 2 takes a quarter of time and memory.
+        output: VOLUME.ome.tif, .npy, or .zarr (with --depths and --voxel-um), float32, planes of CAPTURE's size.
     """
     import numpy as np
 
@@ -125,13 +100,13 @@ def deconvolve_command(
     check_may_write(output, inputs=(capture, *files))
     places, solver = None, None
     if method != "wiener":
-        solver = make_solver(method, steps, weights)
+        solver = make_solver(method, steps, vars(weights))
     elif given := given_options(_ITERATIVE):
         raise InputError(f"{', '.join(given)} must not be given with --method wiener, which takes no steps.")
     if psf_places:
         if depths:
             raise InputError("--depths must not be given with --psf-places, whose z_mm are the depths, got both.")
-        if weights["tv_z"] is not None:
+        if weights.tv_z is not None:
             raise InputError("--tv-z must not be given with --psf-places, got both.")
         places = _read_places(psf_places, psf)
         depths = None if np.isnan(places[:, 2]).any() else np.unique(places[:, 2]).tolist()
@@ -155,7 +130,7 @@ def deconvolve_command(
             with progress.step("Filtering"):
                 volume = filter_image(image, spots)[None]
         else:
-            choose = method == "admm" and weights["tv"] is None
+            choose = method == "admm" and weights.tv is None
             system = fit.operator if fit else spots
             result = run_deconvolution(
                 image, system, solver, choose=choose, stop_at_discrepancy=stop_at_noise, progress=progress
@@ -212,10 +187,9 @@ def _warn_of_cut_psfs(spots):
     if cut:
         number, sides = next(iter(cut.items()))
         which = "the PSF" if len(spots) == 1 else f"PSF {number}" if len(cut) == 1 else f"{len(cut)} of the PSFs"
-        click.echo(
-            f"gs-jax: warning: {which} is cut at the {' and '.join(sides)} by the edge of its image: expect bright "
-            "lines and false light in the scene; measure it with the whole pattern on the sensor.",
-            err=True,
+        print_warning(
+            f"{which} is cut at the {' and '.join(sides)} by the edge of its image: expect bright lines and false "
+            "light in the scene; measure it with the whole pattern on the sensor."
         )
 
 

@@ -1,30 +1,41 @@
-"""`gs-jax layout`, `metrics` and `info`: random lens centres, the datasheet of a design, the machine and files."""
+"""`gs-jax layout`, `metrics`, `info`, `optimize` and `pareto`: layouts, datasheets and searches of designs."""
 
 import re
 from itertools import groupby
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from ..base.errors import InputError
-from ..io.files import check_output, write_json
-from .command import check_may_write, force_option, provenance_of
-from .light import Light, check_beyond, objects_in, sample_options
-from .options import DESIGN, MM, UM, Depths, shipped_designs
+from ..base.progress import Progress
+from ..io.files import check_output, checkpoint_path, make_folder, write_json
+from .command import PARTIAL, RESUMABLE, check_may_write, command, partial_outputs, plural, provenance_of
+from .options import DepthList, DesignPath, Light, Mm, Um, WorkerOptions, objects_in, shipped_designs
 
 
-@click.command("layout", epilog="Example: gs-jax layout --count 200 --size-mm 20 20 --pitch-mm 1.23 -o centers.csv")
-@click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
-@click.option("--size-mm", type=MM, nargs=2, required=True, help="Size of the plate, X Y.")
-@click.option("--pitch-mm", type=MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
-@click.option("--diameter-mm", type=MM, default=2.0, help="Lens diameter; the lenses cover the plate.")
-@click.option("--seed", type=click.IntRange(0), default=0)
-@click.option("-o", "--output", type=Path, required=True, help="CENTERS.csv, with the header x_mm,y_mm.")
-@force_option
+@command("layout", "Example: gs-jax layout --count 200 --size-mm 20 20 --pitch-mm 1.23 -o centers.csv")
 def layout_command(
-    count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path, force: bool
+    *,
+    count: Annotated[int, click.IntRange(1, 100_000)],
+    size_mm: tuple[Mm, Mm],
+    pitch_mm: Mm,
+    diameter_mm: Mm = 2.0,
+    seed: Annotated[int, click.IntRange(0)] = 0,
+    output: Path,
+    force: bool = False,
 ):
-    """Make a random layout of lenses, for the key `centers_file` of a design."""
+    """Make a random layout of lenses, for the key `centers_file` of a design.
+
+    Options:
+        count: Number of lenses.
+        size_mm: Size of the plate, X Y.
+        pitch_mm: Mean distance of a lens from its nearest neighbour.
+        diameter_mm: Lens diameter; the lenses cover the plate.
+        seed: Seed of the layout.
+        output: CENTERS.csv, with the header x_mm,y_mm.
+        force: Replace existing .toml and .csv files.
+    """
     from ..design.centers import write_centers
     from ..layouts import coverage, nearest_neighbour_distances, random_layout
 
@@ -38,46 +49,50 @@ def layout_command(
     click.echo(f"{output}: {count} lenses, {spread}{100 * covered:.1f} % of the plate covered")
 
 
-@click.command("metrics", epilog="Example: gs-jax metrics design/geomscope.toml --depths 18:22:1")
-@click.argument("design", type=DESIGN)
-@click.option("--json", "output", type=Path, help="Also write the numbers to this file.")
-@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven in the working distance]")
-@click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
-@sample_options
+@command("metrics", "Example: gs-jax metrics design/geomscope.toml --depths 18:22:1")
 def metrics_command(
-    design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None, light: Light
+    design: DesignPath,
+    *,
+    json: Path | None = None,
+    depths: DepthList | None = None,
+    confusion_um: Um | None = None,
+    light: Light,
 ):
     """Show what the microscope of DESIGN resolves (the paper's Eqs. 1-11, and exact rays), in five lines.
 
     --verbose adds the tables by depth and all problems; --json has all numbers.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+
+    Options:
+        json: Also write the numbers to this file.
+        depths: START:STOP:STEP in mm. [default: seven in the working distance]
+        confusion_um: Diameter of the circle of confusion, um. [default: two pixels]
     """
     from rich.console import Console
 
     from ..base.progress import VERBOSE, verbosity
-    from ..design.datasheets import band_in_words, datasheet, overview, path_in_words, summary, tables
-    from ..design.design import read_design
+    from ..design.datasheets import datasheet, overview, summary, tables
     from ..design.diagnostics import findings
+    from ..geometry import check_beyond
 
-    if output:
-        check_output(output, [".json"])
-        check_may_write(output, inputs=(design,))
+    if json:
+        check_output(json, [".json"])
+        check_may_write(json, inputs=(design,))
     circle_of_confusion = confusion_um and confusion_um / 1000
-    microscope = light.design(read_design(design))
+    microscope = light.read_design(design)
     if depths:
         check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
-    if output:
-        write_json(output, sheet)
+    if json:
+        write_json(json, sheet)
     click.echo(summary(microscope, sheet))
     click.echo(f"  {objects_in(microscope.imager())}; {_calibration(microscope.provenance)}")
-    lines = overview(microscope, sheet, circle_of_confusion=circle_of_confusion)
-    for words in filter(None, (path_in_words(sheet), band_in_words(sheet), *lines)):
-        click.echo(f"  {words}")
+    for line in overview(microscope, sheet, circle_of_confusion=circle_of_confusion):
+        click.echo(f"  {line}")
     problems = findings(microscope, sheet, circle_of_confusion=circle_of_confusion)
     if verbosity.get() != VERBOSE:
-        click.echo(f"  tables by depth and {len(problems)} remark{'s' * (len(problems) != 1)}: --verbose")
+        click.echo(f"  tables by depth and {plural(len(problems), 'remark')}: --verbose")
         return
     console = Console()
     for table in tables(sheet):
@@ -98,14 +113,15 @@ def _calibration(provenance) -> str:
     return f"calibrated by {spots} spots of {captures} captures, {rms:.3f} pixels RMS: {known}"
 
 
-@click.command("info", epilog="Examples: gs-jax info volume.ome.tif, gs-jax info --designs")
-@click.argument("file", type=Path, required=False)
-@click.option("--designs", is_flag=True, help="List the names of the designs that come with the package.")
-def info_command(file: Path | None, designs: bool):
+@command("info", "Examples: gs-jax info volume.ome.tif, gs-jax info --designs")
+def info_command(file: Path | None = None, *, designs: bool = False):
     """Show versions, devices and memory; with FILE, which gs-jax command made it, and from what.
 
     Of long lists in the design the first lines are shown, with --verbose all. Of an image that another program made:
     its size, type and axes, and what commands take it for.
+
+    Options:
+        designs: List the names of the designs that come with the package.
     """
     from ..base.progress import VERBOSE, verbosity
 
@@ -145,3 +161,109 @@ def _shortened(text: str) -> str:
             part = [*part[:_SHOWN], f"    # and {len(part) - _SHOWN} more"]
         lines += part
     return "\n".join(lines)
+
+
+@command("optimize", "Example: gs-jax optimize design/geomscope.toml --study study.toml -o new.toml")
+def optimize_command(
+    design: DesignPath,
+    *,
+    study: Path,
+    terms: Path | None = None,
+    resume: bool = False,
+    output: Path,
+    workers: WorkerOptions,
+    force: bool = False,
+):
+    """Search for a better microscope than that of the file DESIGN, and compare both.
+
+    NEW.toml.json (the terms, every start and step) and NEW.toml.png (layout and history) are written beside it. Workers
+    run the starts of the study's first stage.
+
+    Options:
+        study: STUDY.toml: free parameters, goals and solvers.
+        terms: FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.
+        resume: Continue from the checkpoint of an interrupted run beside NEW.toml.
+        output: NEW.toml; numbers and a picture are written beside it.
+        force: Replace existing .toml and .csv files.
+    """
+    import jax
+    from rich.console import Console
+
+    from ..codesign import search
+    from ..codesign.search_report import before_and_after, check_outputs, side_files, write_outcome
+    from ..codesign.terms import add_terms
+
+    check_outputs(output)
+    check_may_write(output, *side_files(output), inputs=(design, study, terms), force=force)
+    # Single precision stops far from the minimum.
+    jax.config.update("jax_enable_x64", True)
+    checkpoint = checkpoint_path(output, resume=resume)
+    if resume and not checkpoint.exists():
+        raise InputError(f"--resume must be used after an interrupted run, got no checkpoint {checkpoint}.")
+    if terms:
+        add_terms(terms)
+    partial_outputs[checkpoint] = RESUMABLE
+    with Progress() as progress, workers:
+        options = {"progress": progress, "checkpoint": checkpoint, "resume": resume, "workers": workers}
+        outcome = search.run_study(design, study, **options)
+    write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study, terms))
+    checkpoint.unlink(missing_ok=True)
+    Console().print(before_and_after(outcome))
+    for end in outcome.log.ends:
+        click.echo(f"stage {end['stage'] + 1}, start {end['start']}: {end['reason']} ({end['steps']} steps)")
+    click.echo(f"{output}: {outcome.design.name}, from {outcome.parent.name} in {outcome.seconds:.0f} s")
+
+
+@command("pareto", "Example: gs-jax pareto design/studies/geomscope-sharpness.toml --out front")
+def pareto_command(
+    study: Path, *, out: Path = Path("gs-jax-pareto"), terms: Path | None = None, workers: WorkerOptions
+):
+    """Compute the trade-off of the file STUDY: its one goal against one or two moving limits.
+
+    The folder gets pareto.json, to which each design is added when it is found, and pareto.png.
+
+    Options:
+        out: Folder to write to.
+        terms: FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.
+    """
+    import jax
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..base.errors import errors_name_file
+    from ..codesign.pareto import as_json, picture, sweep_of, trade_off
+    from ..codesign.study import parent_path, read_study
+    from ..codesign.targets import SIGNS
+    from ..codesign.terms import add_terms
+    from ..design.design import design_text, read_design
+    from ..io.files import write_figure
+    from ..io.provenance import KEY
+
+    # Single precision stops far from the minimum.
+    jax.config.update("jax_enable_x64", True)
+    if terms:
+        add_terms(terms)
+    question = read_study(study)
+    start = parent_path(study, question)
+    parent = read_design(start)
+    with errors_name_file(study):
+        sweep_of(parent, question)
+    make_folder(out)
+    numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
+    check_may_write(numbers, drawing, inputs=(study, start, terms))
+    provenance = provenance_of(study, start, terms, design=design_text(parent))
+
+    def each(front):
+        write_json(numbers, {KEY: provenance} | as_json(front))
+        partial_outputs[numbers] = PARTIAL
+
+    with Progress() as progress, workers:
+        front = trade_off(parent, question, each=each, progress=progress, workers=workers)
+    write_figure(drawing, picture(front))
+    limits = [f"{term.name} {SIGNS[term.kind]}" for term in front.objectives[1:]]
+    table = Table(*limits, *(term.name for term in front.objectives), "", box=None, pad_edge=False)
+    for row, point, best in zip(front.values, front.points, front.best, strict=True):
+        status = "" if best else "dominated" if point.feasible else "misses a target"
+        table.add_row(*(f"{x:g}" for x in point.limits), *(f"{x:.4g}" for x in row), status)
+    Console().print(table)
+    click.echo(f"{drawing}: {front.best.sum()} of {len(front.points)} points on the front")

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import click
 
@@ -10,43 +10,44 @@ from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, side_file, write_json
-from .command import check_may_write, force_option, provenance_of
-from .light import Light, check_beyond, objects_in, sample_options
-from .options import DESIGN, UM, Depths, Number, given_options
+from .command import check_may_write, command, given_options, provenance_of
+from .options import DepthList, DesignPath, Light, Number, Seed, Um, objects_in
 
-SMALL_UM, FEATURE_UM = Number(1e-3, 1e3, "um"), Number(1e-2, 1e3, "um")
-PERCENT, DRAFT, HEADROOM = Number(0.0, 20.0, "%"), Number(0.0, 30.0, "degrees"), Number(0.0, 100.0, "mm")
+SmallUm = Annotated[float, Number(1e-3, 1e3, "um")]
+FeatureUm = Annotated[float, Number(1e-2, 1e3, "um")]
 
 
-@click.command("mold", epilog="Example: gs-jax mold design/geomscope.toml -o mold.stl")
-@click.argument("design", type=DESIGN)
-@click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
-@click.option("--positive", is_flag=True, help="Make the array itself instead of its mold.")
-@click.option(
-    "--chord-um",
-    type=SMALL_UM,
-    help="Largest distance between a facet and the lens surface.  [default: 0.4; less if lenses are below 40 um high]",
-)
-@click.option("--shrinkage-percent", type=PERCENT, default=0.0, help="Of the cast material; the part is made larger.")
-@click.option("--draft-deg", type=DRAFT, default=0.0, help="Of the walls' inner faces. Silicone needs none.")
-@click.option("--headroom-mm", type=HEADROOM, default=0.0, help="Walls above the array; 0 to cast under a glass plate.")
-@click.option("--resolution-um", type=FEATURE_UM, default=25.0, help="Smallest feature of the printer.")
-@click.option("--layer-um", type=FEATURE_UM, help="Thickness of the printer's layers, if any.")
-@click.option("--label/--no-label", default=True, help="Engrave the design's name in the rim.")
+@command("mold", "Example: gs-jax mold design/geomscope.toml -o mold.stl")
 def mold_command(
-    design: Path,
+    design: DesignPath,
+    *,
     output: Path,
-    positive: bool,
-    label: bool,
-    chord_um: float | None,
-    layer_um: float | None,
-    **sizes: float,
+    positive: bool = False,
+    chord_um: SmallUm | None = None,
+    shrinkage_percent: Annotated[float, Number(0.0, 20.0, "%")] = 0.0,
+    draft_deg: Annotated[float, Number(0.0, 30.0, "degrees")] = 0.0,
+    headroom_mm: Annotated[float, Number(0.0, 100.0, "mm")] = 0.0,
+    resolution_um: FeatureUm = 25.0,
+    layer_um: FeatureUm | None = None,
+    label: bool = True,
 ):
     """Make the negative mold of the array of the file DESIGN, to print and cast the array in.
 
     Units are mm. The lenses face -z. If the plano side faces the object, x and y are the design's; if the curved side
     does, the array is turned over about x, and y is reversed. A picture (MOLD.stl.png) and a report
     (MOLD.stl.json, MOLD.stl.txt) are written beside it; the mold is read back and measured.
+
+    Options:
+        output: MOLD.stl or MOLD.3mf.
+        positive: Make the array itself instead of its mold.
+        chord_um: Largest distance between a facet and the lens surface. [default: 0.4; less if lenses are below 40 um
+            high]
+        shrinkage_percent: Of the cast material; the part is made larger.
+        draft_deg: Of the walls' inner faces. Silicone needs none.
+        headroom_mm: Walls above the array; 0 to cast under a glass plate.
+        resolution_um: Smallest feature of the printer.
+        layer_um: Thickness of the printer's layers, if any.
+        label: Engrave the design's name in the rim.
     """
     from ..design.design import design_text, read_design
     from ..mold.export import MESH_SUFFIXES
@@ -60,28 +61,34 @@ def mold_command(
     check_may_write(output, *beside, inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
-        draft=math.radians(sizes["draft_deg"]),
-        headroom=sizes["headroom_mm"],
-        shrinkage=sizes["shrinkage_percent"] / 100,
+        draft=math.radians(draft_deg),
+        headroom=headroom_mm,
+        shrinkage=shrinkage_percent / 100,
         label=microscope.name if label else "",
     )
-    accuracy = {"chord": chord_um and chord_um / 1000, "resolution": sizes["resolution_um"] / 1000}
+    options = {
+        "positive": positive,
+        "shape": shape,
+        "chord": chord_um and chord_um / 1000,
+        "resolution": resolution_um / 1000,
+        "layer": layer_um and layer_um / 1000,
+    }
     provenance = provenance_of(design, design=design_text(microscope))
     with Progress() as progress, errors_name_file(design):
-        options = {"positive": positive, "shape": shape, "layer": layer_um and layer_um / 1000, **accuracy}
         report = make_mold(microscope, output, **options, provenance=provenance, progress=progress)
     click.echo(report_text(report), nl=False)
 
 
-@click.command("mask", epilog="Example: gs-jax mask design/geomscope-optimized.toml -o mask.dxf")
-@click.argument("design", type=DESIGN)
-@click.option("-o", "--output", type=Path, required=True, help="MASK.dxf, MASK.svg, or MASK.gds for GDSII.")
-def mask_command(design: Path, output: Path):
+@command("mask", "Example: gs-jax mask design/geomscope-optimized.toml -o mask.dxf")
+def mask_command(design: DesignPath, *, output: Path):
     """Draw the opaque mask between the lenses of the file DESIGN, to have it made.
 
     Openings are the lenses' clear apertures. The sheet has the size and alignment marks of the mold, and is seen from
     above, from the plano side of the lenses. DXF and SVG are in mm, GDSII in um (needs `pip install 'gs-jax[gds]'`). A
     file of its name plus .json has the provenance.
+
+    Options:
+        output: MASK.dxf, MASK.svg, or MASK.gds for GDSII.
     """
     from ..design.conversion import AIR
     from ..design.design import design_text, read_design
@@ -98,24 +105,19 @@ def mask_command(design: Path, output: Path):
     click.echo(f"{output}: {alone} round openings and {rings} others on a sheet of {width:g} x {height:g} mm")
 
 
-@click.command("heights", epilog="Example: gs-jax heights design/geomscope.toml -o array.tif")
-@click.argument("design", type=DESIGN)
-@click.option(
-    "-o",
-    "--output",
-    type=Path,
-    required=True,
-    help="HEIGHTS.tif (float, mm), .png (16 bits), .xyz (text), .dat (grid sag of OpticStudio); LENSES.csv.",
-)
-@click.option("--step-um", type=SMALL_UM, default=10.0, help="Distance of points; not of LENSES.csv.")
-@force_option
-def heights_command(design: Path, output: Path, step_um: float, force: bool):
+@command("heights", "Example: gs-jax heights design/geomscope.toml -o array.tif")
+def heights_command(design: DesignPath, *, output: Path, step_um: SmallUm = 10.0, force: bool = False):
     """Write the molded surface of the file DESIGN for its maker, or for an optical program.
 
     TIFF, PNG and text hold heights above the plate between the lenses, seen from the lenses' side: x to the right, y
     up. A grid sag, and the list of a plate and its lenses for non-sequential rays, have z along the light, and z = 0 at
     the vertices. A .json of the output's name plus .json has the frame and scale. The file is read back and compared
     with the design.
+
+    Options:
+        output: HEIGHTS.tif (float, mm), .png (16 bits), .xyz (text), .dat (grid sag of OpticStudio); LENSES.csv.
+        step_um: Distance of points; not of LENSES.csv.
+        force: Replace existing .toml and .csv files.
     """
     from ..design.design import design_text, read_design
     from ..io.provenance import sidecar
@@ -136,56 +138,53 @@ def heights_command(design: Path, output: Path, step_um: float, force: bool):
     click.echo(f"{output}: {report['frame']}; (x, y) of the design is ({report['design_x_y']})")
 
 
-def _options(command):
-    """Add an option for each tolerance."""
-    for name, field in reversed(ToleranceSpec.model_fields.items()):
+def _tolerance_options() -> list[click.Option]:
+    """An option for each tolerance."""
+    options = []
+    for name, field in ToleranceSpec.model_fields.items():
         least, most = (getattr(bound, side) for bound, side in zip(field.metadata, ("ge", "le"), strict=True))
         unit = name.rpartition("_")[2] if "_" in name else ""
         text = f"{str(field.title)[:1].upper()}{str(field.title)[1:]}.  [default: {field.default:g}]"
         kind = Number(least=float(least), most=float(most), unit=unit)
-        command = click.option(f"--{name.replace('_', '-')}", type=kind, help=text)(command)
-    return command
+        options.append(click.Option([name, f"--{name.replace('_', '-')}"], type=kind, help=text))
+    return options
 
 
-@click.command("tolerance", epilog="Example: gs-jax tolerance geomscope --sensor-distance-um 20 -o tolerance.json")
-@click.argument("design", type=DESIGN)
-@click.option(
-    "-o", "--output", type=Path, help="TOLERANCE.json: write the numbers, and beside it a picture (.json.png)."
+@command(
+    "tolerance",
+    "Example: gs-jax tolerance geomscope --sensor-distance-um 20 -o tolerance.json",
+    more=_tolerance_options(),
 )
-@click.option("--tolerances", "file", type=Path, help="TOML file of tolerances: position_um = 3.0 and so on.")
-@_options
-@click.option("--max-width-um", type=UM, help="Target: width of spots in the object.  [default: 1.2 of the design's]")
-@click.option(
-    "--min-strehl",
-    type=Number(1e-3, 1.0),
-    help="Target: Strehl ratio on the axis.  [default: 0.8 times the design's, if that is 0.1 or more]",
-)
-@click.option(
-    "--max-depth-error-um", type=UM, help="Target: error of calibrated depths.  [default: the axial resolution, Eq. 6]"
-)
-@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: five in the working distance]")
-@click.option("--positions", type=Path, help="POINTS.csv: x_mm,y_mm,z_mm of calibration sources.  [default: four]")
-@click.option("--draws", type=click.IntRange(1, 10**6), default=1000, help="Random devices.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the devices.")
-@sample_options
 def tolerance_command(
-    design: Path,
-    output: Path | None,
-    file: Path | None,
-    max_width_um: float | None,
-    min_strehl: float | None,
-    max_depth_error_um: float | None,
-    depths: list[float] | None,
-    positions: Path | None,
-    draws: int,
-    seed: int,
+    design: DesignPath,
+    *,
+    output: Path | None = None,
+    tolerances: Path | None = None,
+    max_width_um: Um | None = None,
+    min_strehl: Annotated[float, Number(1e-3, 1.0)] | None = None,
+    max_depth_error_um: Um | None = None,
+    depths: DepthList | None = None,
+    positions: Path | None = None,
+    draws: Annotated[int, click.IntRange(1, 10**6)] = 1000,
+    seed: Seed = 0,
     light: Light,
-    **tolerances: Any,
+    **values: float | None,
 ):
     """Show the effect of tolerances on the spots and depths of the microscope of DESIGN, and the yield.
 
     Tolerances are standard deviations; roughness and printed layers are the same in every device. Depth errors are
     those of points located with the design's geometry, and with a calibrated one.
+
+    Options:
+        output: TOLERANCE.json: write the numbers, and beside it a picture (.json.png).
+        tolerances: TOML file of tolerances: position_um = 3.0 and so on.
+        max_width_um: Target: width of spots in the object. [default: 1.2 of the design's]
+        min_strehl: Target: Strehl ratio on the axis. [default: 0.8 times the design's, if that is 0.1 or more]
+        max_depth_error_um: Target: error of calibrated depths. [default: the axial resolution, Eq. 6]
+        depths: START:STOP:STEP in mm. [default: five in the working distance]
+        positions: POINTS.csv: x_mm,y_mm,z_mm of calibration sources. [default: four]
+        draws: Random devices.
+        seed: Seed of the devices.
     """
     import jax
     import numpy as np
@@ -194,7 +193,8 @@ def tolerance_command(
     from ..apps.tolerance_analysis import tolerance
     from ..apps.tolerance_report import as_json, picture, sentences, tables
     from ..apps.tolerance_spec import read_tolerances
-    from ..design.design import design_text, read_design
+    from ..design.design import design_text
+    from ..geometry import check_beyond
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
     from ..io.provenance import KEY
@@ -205,30 +205,32 @@ def tolerance_command(
     if output and drawing:
         check_output(output, [".json"])
         check_output(drawing, [".png"])
-        check_may_write(output, drawing, inputs=(design, file, positions))
-    given = {name: value for name, value in tolerances.items() if value is not None}
-    chosen = (read_tolerances(file) if file else ToleranceSpec()).model_copy(update=given)
+        check_may_write(output, drawing, inputs=(design, tolerances, positions))
+    given = {name: value for name, value in values.items() if value is not None}
+    chosen = (read_tolerances(tolerances) if tolerances else ToleranceSpec()).model_copy(update=given)
     sources = None
     if positions:
         sources, _ = read_positions(positions, [])
         if not len(sources) or np.isnan(sources).any() or not (sources[:, 2] > 0).all():
             raise InputError(f"{positions}: every source must have x, y and z > 0, got one without.")
-    microscope = light.design(read_design(design))
+    microscope = light.read_design(design)
     check_beyond(microscope.imager(), [*(depths or ()), *([] if sources is None else sources[:, 2])], "depths")
-    um = lambda value: value and value / 1000
-    targets = {"max_width": um(max_width_um), "min_strehl": min_strehl, "max_depth_error": um(max_depth_error_um)}
+    targets = {
+        "max_width": max_width_um and max_width_um / 1000,
+        "min_strehl": min_strehl,
+        "max_depth_error": max_depth_error_um and max_depth_error_um / 1000,
+    }
     with Progress() as progress, errors_name_file(design):
-        found = tolerance(
-            microscope, chosen, depths=depths, sources=sources, draws=draws, seed=seed, progress=progress, **targets
-        )
+        options = {"depths": depths, "sources": sources, "draws": draws, "seed": seed, "progress": progress}
+        result = tolerance(microscope, chosen, **options, **targets)
     if output and drawing:
-        provenance = provenance_of(design, file, positions, design=design_text(microscope))
-        write_json(output, {KEY: provenance, "seed": seed} | as_json(found))
-        write_figure(drawing, picture(found))
+        provenance = provenance_of(design, tolerances, positions, design=design_text(microscope))
+        write_json(output, {KEY: provenance, "seed": seed} | as_json(result))
+        write_figure(drawing, picture(result))
     click.echo(objects_in(microscope.imager()))
     console = Console()
-    for table in tables(found):
+    for table in tables(result):
         console.print(table)
         console.print()
-    for sentence in sentences(found):
+    for sentence in sentences(result):
         click.echo(f"- {sentence}")

@@ -1,20 +1,23 @@
-"""Parameter types and options that several commands share, and the reading of captures with them.
+"""Types of options, and options that several commands share: of captures, of the light's path, and of workers.
 
 Commands import what they run only when they run, so that their help is quick. So the names of methods and models are
 repeated here.
 """
 
-import functools
 import itertools
 import math
+import warnings
 from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
-from click.core import ParameterSource
 
-from ..base.workers import Workers
+from ..base.errors import InputError, InputWarning, input_error
+from ..base.machine import Workers
+from .command import OptionGroup, print_warning
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MAX_DEPTHS = 10_000
@@ -28,19 +31,13 @@ SUPPRESSIONS = ("none", "points", "clusters", "unet")
 FIDELITIES = ("full", "near", "pinhole")
 SIMULATED = ("full", "near")
 PSFS = ("diffraction", "geometric", "gaussian")
-CHANNELS = ("red", "green", "blue")
-PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-# Names of the options that read a picture, and of those of a capture.
-_PICTURE = ("page", "channel", "bayer", "dark", "flat", "bad_pixels", "offset")
-CAPTURE_OPTIONS = (*_PICTURE, "roi", "binning")
 
 
 class Number(click.ParamType):
     """A number within bounds. A length beyond the `usual` ones that would be one of them in another unit is refused."""
 
     def __init__(self, least: float, most: float, unit: str = "", usual: tuple[float, float] | None = None):
-        self.least, self.most, self.unit, self.name = least, most, unit, unit or "number"
-        self.usual = usual
+        self.least, self.most, self.unit, self.name, self.usual = least, most, unit, unit or "number", usual
 
     def convert(self, value, param, ctx):
         try:
@@ -152,88 +149,68 @@ def shipped_designs() -> list[Path]:
 
 
 DESIGN = DesignFile()
+DesignPath = Annotated[Path, DESIGN]
+DepthList = Annotated[list[float], Depths()]
+Steps = Annotated[int, click.IntRange(1, 100_000)]
+Seed = Annotated[int, click.IntRange(0, 2**31 - 1)]
+Binning = Annotated[int, click.IntRange(1, 64)]
 # Lengths on a plate; and in the image or the object, of a voxel or a blur.
-MM = Number(1e-3, 1e4, "mm", usual=(0.005, 500.0))
-UM = Number(1e-2, 1e6, "um", usual=(0.1, 2e4))
+Mm = Annotated[float, Number(1e-3, 1e4, "mm", usual=(0.005, 500.0))]
+Um = Annotated[float, Number(1e-2, 1e6, "um", usual=(0.1, 2e4))]
+Counts = Annotated[float, Number(0.0, 65535.0, "counts")]
 
 
-terms_option = click.option(
-    "--terms",
-    type=Path,
-    help="FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.",
-)
+class WorkerOptions(Workers, OptionGroup):
+    """The workers of a command, which enters them when there is work.
+
+    Options:
+        workers: Number of processes on this machine that share the work. Needs pip install 'gs-jax[cluster]'.
+            [default: this process]
+        scheduler: Dask scheduler whose workers do the work: tcp://HOST:8786.
+    """
+
+    def __init__(self, workers: Annotated[int, click.IntRange(1, 1000)] | None = None, scheduler: str | None = None):
+        super().__init__(workers, scheduler)
 
 
-def worker_options(command):
-    """Add `--workers` and `--scheduler`; the command receives `workers`, which it enters when there is work."""
+@dataclass
+class PictureOptions(OptionGroup):
+    """Reads captures of any camera, and collects what was corrected in them.
 
-    @functools.wraps(command)
-    def wrapper(*args, workers, scheduler, **kwargs):
-        return command(*args, workers=Workers(workers, scheduler), **kwargs)
+    Options:
+        page: Page of a capture of several, from 1; or mean, to average repeated frames.
+        channel: Channel of a colour capture or of a --bayer mosaic.
+        bayer: The capture is a raw mosaic whose first pixels are these. Nothing is interpolated.
+        dark: DARK.tif: dark frame of the capture's exposure; several pages are averaged.
+        flat: FLAT.tif: even light on the sensor without the array; several pages are averaged.
+        bad_pixels: MASK.png, nonzero at bad pixels; none; or auto: hot pixels of DARK, or isolated ones of the capture.
+        offset: Counts of a dark pixel, if there is no --dark.
+    """
 
-    count = click.option(
-        "--workers",
-        type=click.IntRange(1, 1000),
-        help="Number of processes on this machine that share the work. Needs pip install 'gs-jax[cluster]'.  "
-        "[default: this process]",
-    )
-    address = click.option("--scheduler", help="Dask scheduler whose workers do the work: tcp://HOST:8786.")
-    return count(address(wrapper))
+    page: Annotated[int | str | None, Page()] = None
+    channel: Annotated[str, click.Choice(["red", "green", "blue"])] | None = None
+    bayer: Annotated[str, click.Choice(["RGGB", "BGGR", "GRBG", "GBRG"])] | None = None
+    dark: Path | None = None
+    flat: Path | None = None
+    bad_pixels: str = "auto"
+    offset: Counts = 0.0
+    # Lines to print, with the captures that each is about, and warnings.
+    done: dict[str, list[Path]] = field(default_factory=dict, init=False)
+    warnings: dict[str, None] = field(default_factory=dict, init=False)
+    sensor: Any = field(default=None, init=False)
 
+    @cached_property
+    def readout(self):
+        from ..io.camera import Readout
 
-_FORMAT_OPTIONS = (
-    click.option(
-        "--page", type=Page(), help="Page of a capture of several, from 1; or mean, to average repeated frames."
-    ),
-    click.option("--channel", type=click.Choice(CHANNELS), help="Channel of a colour capture or of a --bayer mosaic."),
-    click.option(
-        "--bayer",
-        type=click.Choice(PATTERNS),
-        help="The capture is a raw mosaic whose first pixels are these. Nothing is interpolated.",
-    ),
-)
-_REGION_OPTIONS = (
-    click.option("--roi", type=Region(), help="Region of the sensor that the capture covers, in unbinned pixels."),
-    click.option(
-        "--binning",
-        type=click.IntRange(1, 64),
-        default=1,
-        help="Side of the squares of pixels that the camera combined.",
-    ),
-)
-_CORRECTION_OPTIONS = (
-    click.option(
-        "--dark", type=Path, help="DARK.tif: dark frame of the capture's exposure; several pages are averaged."
-    ),
-    click.option(
-        "--flat", type=Path, help="FLAT.tif: even light on the sensor without the array; several pages are averaged."
-    ),
-    click.option(
-        "--bad-pixels",
-        default="auto",
-        help="MASK.png, nonzero at bad pixels; none; or auto: hot pixels of DARK, or isolated ones of the capture.",
-    ),
-    click.option(
-        "--offset",
-        type=Number(0.0, 65535.0, "counts"),
-        default=0.0,
-        help="Counts of a dark pixel, if there is no --dark.",
-    ),
-)
+        return Readout(None, 1, self.bayer, self.channel)
 
+    @cached_property
+    def correction(self):
+        from ..io.camera import Correction
 
-class CaptureOptions:
-    """Reads captures with the capture options, and collects what was corrected in them."""
-
-    def __init__(self, page=None, channel=None, bayer=None, roi=None, binning=1, *, dark, flat, bad_pixels, offset):
-        from ..io.camera import Correction, Readout
-
-        self.page, self.readout = page, Readout(roi, binning, bayer, channel)
-        mask = bad_pixels if bad_pixels in ("auto", "none") else Path(bad_pixels)
-        self.correction = Correction(dark, flat, mask, offset)
-        self.sensor: Any = None
-        # Lines to print, with the captures that each is about.
-        self.done, self.warnings = {}, {}
+        mask = self.bad_pixels if self.bad_pixels in ("auto", "none") else Path(self.bad_pixels)
+        return Correction(self.dark, self.flat, mask, self.offset)
 
     @property
     def files(self) -> list[Path]:
@@ -241,20 +218,12 @@ class CaptureOptions:
         candidates = (self.correction.dark, self.correction.flat, self.correction.bad_pixels)
         return [path for path in candidates if isinstance(path, Path)]
 
-    def imager(self, imager):
-        """The microscope with the pixels of its captures."""
-        import equinox as eqx
-
-        self.sensor = imager.sensor
-        return eqx.tree_at(lambda i: i.sensor, imager, self.readout.sensor(imager.sensor))
-
     def read(self, path: Path):
         """Read and correct a capture."""
         from ..io.camera import read_corrected
 
-        return self._note(
-            path, read_corrected(path, self.sensor, page=self.page, readout=self.readout, correction=self.correction)
-        )
+        options = {"page": self.page, "readout": self.readout, "correction": self.correction}
+        return self._note(path, read_corrected(path, self.sensor, **options))
 
     def read_spots(self, paths: tuple[Path, ...], page: int | str | None):
         """Read and correct images of a point as planes, one for each page; or for each file with `page`.
@@ -262,7 +231,7 @@ class CaptureOptions:
         Single sharp pixels are kept. A colour capture and grey images of the point may be combined. Returns a list, as
         the planes may differ in size.
         """
-        from ..io.recordings import read_spots
+        from ..io.plane_stacks import read_spots
 
         spots = read_spots(paths, page=page, readout=self.readout, correction=self.correction)
         return [self._note(path, capture) for path, capture in spots]
@@ -272,33 +241,6 @@ class CaptureOptions:
             self.done.setdefault(line, []).append(path)
         self.warnings |= dict.fromkeys(capture.warnings)
         return capture.image
-
-    def frames(self, recording):
-        """Read the correction of a recording; return the function that reads a frame.
-
-        It returns the frame's image, float32, and lines about corrections and warnings of this frame alone.
-        """
-        import numpy as np
-
-        from ..io.camera import prepare, read_frame
-        from ..io.captures import Selection
-
-        shape, readout = self.readout.region(self.sensor).shape, self.readout
-        wanted = Selection(shape, None, readout.channel, readout.bayer)
-        prepared = prepare(readout.sensor(self.sensor).shape, shape, readout, self.correction)
-        self.done = {line: [Path(f"{len(recording.names)} frames")] for line in prepared.done}
-        shared = [*prepared.done, *prepared.warnings]
-        self.warnings |= dict.fromkeys(prepared.warnings)
-
-        def read(frame):
-            capture = read_frame(recording.names[frame], recording.images(frame, wanted), prepared, readout)
-            done, warnings = (
-                [line for line in lines if line not in shared] for lines in (capture.done, capture.warnings)
-            )
-            # One type for all frames, so that nothing is compiled twice.
-            return np.asarray(capture.image, np.float32), done, warnings
-
-        return read
 
     def recorded(self, provenance: dict[str, str]) -> dict[str, str]:
         """Add the corrections to a provenance."""
@@ -311,42 +253,185 @@ class CaptureOptions:
         for line in self._lines():
             click.echo(line)
         for line in self.warnings:
-            click.echo(f"gs-jax: warning: {line}", err=True)
+            print_warning(line)
 
-    def _lines(self):
-        names = lambda paths: paths[0].name if len(paths) == 1 else f"{len(paths)} captures"
-        return [f"{names(paths)}: {line}" for line, paths in self.done.items()]
-
-
-def capture_options(command):
-    """Add the options of captures; the command receives them as `camera`, a `CaptureOptions`."""
-    return _with_camera(command, (*_FORMAT_OPTIONS, *_REGION_OPTIONS, *_CORRECTION_OPTIONS), CAPTURE_OPTIONS)
+    def _lines(self) -> list[str]:
+        return [
+            f"{paths[0].name if len(paths) == 1 else f'{len(paths)} captures'}: {line}"
+            for line, paths in self.done.items()
+        ]
 
 
-def picture_options(command):
-    """As `capture_options`, without those that place the capture on a sensor."""
-    return _with_camera(command, (*_FORMAT_OPTIONS, *_CORRECTION_OPTIONS), _PICTURE)
+@dataclass
+class CaptureOptions(PictureOptions):
+    """Reads captures by the sensor of a design.
+
+    Options:
+        roi: Region of the sensor that the capture covers, in unbinned pixels.
+        binning: Side of the squares of pixels that the camera combined.
+    """
+
+    roi: Annotated[tuple[int, int, int, int], Region()] | None = None
+    binning: Binning = 1
+
+    @cached_property
+    def readout(self):
+        from ..io.camera import Readout
+
+        return Readout(self.roi, self.binning, self.bayer, self.channel)
+
+    def imager(self, imager):
+        """The microscope with the pixels of its captures."""
+        import equinox as eqx
+
+        self.sensor = imager.sensor
+        return eqx.tree_at(lambda i: i.sensor, imager, self.readout.sensor(imager.sensor))
+
+    def frames(self, recording):
+        """Read the correction of a recording; return the function that reads a frame.
+
+        It returns the frame's image, float32, and lines about corrections and warnings of this frame alone.
+        """
+        import numpy as np
+
+        from ..io.camera import prepare, read_frame
+        from ..io.captures import Selection
+
+        shape, readout = self.readout.region(self.sensor).shape, self.readout
+        selection = Selection(shape, None, readout.channel, readout.bayer)
+        prepared = prepare(readout.sensor(self.sensor).shape, shape, readout, self.correction)
+        self.done = {line: [Path(f"{len(recording.names)} frames")] for line in prepared.done}
+        shared = [*prepared.done, *prepared.warnings]
+        self.warnings |= dict.fromkeys(prepared.warnings)
+
+        def read(frame):
+            capture = read_frame(recording.names[frame], recording.images(frame, selection), prepared, readout)
+            done, warnings = (
+                [line for line in lines if line not in shared] for lines in (capture.done, capture.warnings)
+            )
+            # One type for all frames, so that nothing is compiled twice.
+            return np.asarray(capture.image, np.float32), done, warnings
+
+        return read
 
 
-def given_options(names: Iterable[str]) -> list[str]:
-    """Those of some options of the running command that its user gave, as `--name`."""
-    source = click.get_current_context().get_parameter_source
-    return [f"--{name.replace('_', '-')}" for name in names if source(name) is ParameterSource.COMMANDLINE]
+# Options of captures, and of `Light`, by name.
+CAPTURE_OPTIONS = ("page", "channel", "bayer", "dark", "flat", "bad_pixels", "offset", "roi", "binning")
+LIGHT_OPTIONS = ("sample", "sample_index", "sample_at", "wavelength_nm")
 
 
-def _with_camera(command, options, names):
-    @functools.wraps(command)
-    def wrapper(*args, **kwargs):
-        camera = CaptureOptions(**{name: kwargs.pop(name) for name in names})
-        return command(*args, camera=camera, **kwargs)
+@dataclass(frozen=True)
+class Light(OptionGroup):
+    """The medium of the object, and the wavelength at which it is seen.
 
-    for option in reversed(options):
-        wrapper = option(wrapper)
-    return wrapper
+    Options:
+        sample: NAME of one of [samples] in DESIGN, or none for air. [default: DESIGN's [sample]]
+        sample_index: Refractive index of the object's medium.
+        sample_at: Depth at which that medium begins.
+        wavelength_nm: Wavelength of the light. [default: DESIGN's]
+    """
+
+    sample: str | None = None
+    sample_index: Annotated[float, Number(1.0, 5.0)] | None = None
+    sample_at: Annotated[float, Number(0.0, 1e4, "mm", usual=(0.0, _FARTHEST))] | None = None
+    wavelength_nm: Annotated[float, Number(10.0, 1e5, "nm")] | None = None
+
+    def __post_init__(self):
+        if (self.sample_index is None) != (self.sample_at is None):
+            given, other = ("--sample-at", "--sample-index")[:: 1 if self.sample_index is None else -1]
+            raise InputError(f"{given} must be used with {other}.")
+        if self.sample is not None and self.sample_index is not None:
+            raise InputError("--sample must be used without --sample-index and --sample-at.")
+
+    def imager(self, design) -> Any:
+        """The geometry of a design with these."""
+        from ..layers import Sample
+
+        sample = self.sample if self.sample_index is None else Sample(self.sample_index, self.sample_at)
+        return design.imager(sample, self.wavelength_nm)
+
+    def read_design(self, path: Path) -> Any:
+        """Read a design, with these in place of its own; its working distance begins in the object's medium."""
+        from ..design.conversion import object_begins, sample_table
+        from ..design.design import read_design
+
+        design, changes = read_design(path), {}
+        if self.wavelength_nm is not None:
+            changes["wavelength_nm"] = self.wavelength_nm
+        if self.sample_index is not None:
+            changes["sample"] = {"refractive_index": self.sample_index, "surface_mm": self.sample_at}
+        elif self.sample is not None or design.samples:
+            changes["sample"] = sample_table(design, self.sample)
+        changed = design.replace(**changes) if changes else design
+        begins, (near, far) = object_begins(changed), changed.imaging.working_distance_mm
+        return changed if near >= begins else changed.replace(working_distance_mm=(begins, far))
+
+
+@dataclass(frozen=True)
+class DepthLight(Light):
+    """As `Light`, with the origin of depths.
+
+    Options:
+        depths_from: What depths count from: the array's front, or the sample's surface. Files say which.
+    """
+
+    depths_from: Annotated[str, click.Choice(["array", "sample"])] = "array"
+
+    def origin(self, imager) -> float | None:
+        """Depth from which depths count, mm; None if it is the array."""
+        if self.depths_from == "array":
+            return None
+        if imager.sample is None:
+            raise InputError("--depths-from sample must be used with a sample, got air.")
+        return float(str(imager.sample_surface))
+
+    def from_array(self, depths: list[float], imager) -> list[float]:
+        """Depths of the command line, counted from the array."""
+        from ..geometry import check_beyond
+
+        origin = self.origin(imager)
+        moved = depths if origin is None else [round(depth + origin, 9) for depth in depths]
+        if min(moved) < NEAREST:
+            raise InputError(f"--depths must be {NEAREST:g} mm or more from the array, got {min(moved):g}.")
+        check_beyond(imager, moved, "--depths")
+        return moved
+
+
+def objects_in(imager) -> str:
+    """The medium that a command takes to hold the object, as text."""
+    from ..design.conversion import medium_in_words
+
+    return f"objects in {medium_in_words(imager)}"
+
+
+def ask_for_unit(path, points) -> None:
+    """Warn, as for keys of designs, if all of several points of a file are so far away that they may be in um."""
+    from ..design.validation import USUAL, slip
+
+    depths, key = points[:, 2], "imaging.working_distance_mm"
+    if len(depths) > 1 and (depths > USUAL[key][1]).all():
+        ends = sorted({float(depths.min()), float(depths.max())})
+        if question := slip(key, ends, "z_mm"):
+            warnings.warn(f"{path}: {question}", InputWarning, stacklevel=2)
+
+
+def check_even(output: Path, depths: list[float] | None) -> None:
+    """Raise `InputError` before the work if a file has one step for all depths, and they are uneven."""
+    if output.suffix.lower() != ".zarr" or not depths or len(depths) < 3:
+        return
+    steps = [after - before for before, after in itertools.pairwise(depths)]
+    if max(steps) - min(steps) > 1e-6 * max(depths):
+        raise input_error("depths", "in even steps for OME-Zarr", "uneven ones; use .ome.tif", output)
+
+
+def voxels(shape: Iterable[int], axes: str, pitch: float, depths: list[float], imager) -> str:
+    """Size, pitch, depths and medium of a volume, as text."""
+    size = f"{' x '.join(map(str, shape))} voxels ({axes}), {pitch * 1000:.4g} um laterally"
+    return f"{size}, {depth_range(depths)}, {objects_in(imager)}"
 
 
 def depth_range(depths: list[float]) -> str:
-    """The depths in words."""
+    """The depths as text."""
     if len(depths) == 1:
         return f"at {depths[0]:g} mm"
     if len(depths) == 2:

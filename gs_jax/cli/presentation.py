@@ -2,32 +2,29 @@
 
 from importlib import import_module
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
-from .command import PARTIAL, check_may_write, partial_outputs, provenance_of
-from .light import Light, objects_in, sample_options
-from .options import CAPTURE_OPTIONS, DESIGN, CaptureOptions, capture_options, given_options, terms_option
+from .command import PARTIAL, check_may_write, command, given_options, partial_outputs, provenance_of
+from .options import CAPTURE_OPTIONS, CaptureOptions, DesignPath, Light, objects_in
 
 
-@click.command(
-    "report",
-    epilog="Example: gs-jax report my.toml volume.ome.tif --points beads.csv --capture beads.tif -o beads.html",
-)
-@click.argument("design", type=DESIGN)
-@click.argument("volume", type=Path, required=False)
-@click.option("-o", "--output", type=Path, required=True, help="REPORT.html.")
-@click.option("--points", type=Path, help="POINTS.csv: points for a table and a 3-D view.")
-@click.option("--surface", type=Path, help="SURFACE.ome.tif of `gs-jax reconstruct`: maps and a 3-D view.")
-@click.option("--capture", type=Path, help="CAPTURE.tif: the capture of VOLUME.")
-@click.option("--tolerance", type=Path, help="TOLERANCE.json of `gs-jax tolerance -o`.")
-@sample_options
-@capture_options
+@command("report", "Example: gs-jax report my.toml volume.ome.tif --points beads.csv --capture beads.tif -o beads.html")
 def report_command(
-    design: Path, volume: Path | None, output: Path, light: Light, camera: CaptureOptions, **files: Path | None
+    design: DesignPath,
+    volume: Path | None = None,
+    *,
+    output: Path,
+    points: Path | None = None,
+    surface: Path | None = None,
+    capture: Path | None = None,
+    tolerance: Path | None = None,
+    light: Light,
+    camera: CaptureOptions,
 ):
     """Write one page, for any browser and without a network, about the microscope of DESIGN and a reconstruction.
 
@@ -37,15 +34,21 @@ def report_command(
     15 MB.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+
+    Options:
+        output: REPORT.html.
+        points: POINTS.csv: points for a table and a 3-D view.
+        surface: SURFACE.ome.tif of `gs-jax reconstruct`: maps and a 3-D view.
+        capture: CAPTURE.tif: the capture of VOLUME.
+        tolerance: TOLERANCE.json of `gs-jax tolerance -o`.
     """
     from ..apps.report.page import write_report
     from ..apps.report.report_tables import read_tolerance
-    from ..design.design import design_text, read_design
+    from ..design.design import design_text
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
     from ..io.volumes import read_surface, read_volume
 
-    points, surface, capture, tolerance = (files[name] for name in ("points", "surface", "capture", "tolerance"))
     inputs = (design, volume, points, surface, capture, tolerance)
     check_output(output, [".html"])
     if not capture and (given := given_options(CAPTURE_OPTIONS)):
@@ -55,7 +58,7 @@ def report_command(
     check_may_write(output, inputs=(*inputs, *camera.files))
     if volume and volume.suffix.lower() in (".csv", ".toml"):
         raise input_error("VOLUME", ".ome.tif or .zarr (points are given by --points)", volume.suffix, volume)
-    microscope, results = light.design(read_design(design)), {}
+    microscope, results = light.read_design(design), {}
     if volume:
         results["volume"], results["grid"] = read_volume(volume)
     if surface:
@@ -78,18 +81,16 @@ def report_command(
     click.echo(f"{output}: {size}; {objects_in(microscope.imager())}")
 
 
-@click.command("explore", epilog="Example: gs-jax explore geomscope --study targets.toml -o mine.toml")
-@click.argument("design", type=DESIGN)
-@click.option("--study", type=Path, help="STUDY.toml whose targets are evaluated, as in `gs-jax optimize`.")
-@click.option(
-    "-o", "--output", type=Path, help="NEW.toml to save to; a number is added if it exists.  [default: NAME-new.toml]"
-)
-@terms_option
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0 takes a free one.")
-@click.option("--browser/--no-browser", default=True, help="Open the page in a browser.")
-@sample_options
+@command("explore", "Example: gs-jax explore geomscope --study targets.toml -o mine.toml")
 def explore_command(
-    design: Path, study: Path | None, terms: Path | None, output: Path | None, port: int, browser: bool, light: Light
+    design: DesignPath,
+    *,
+    study: Path | None = None,
+    output: Path | None = None,
+    terms: Path | None = None,
+    port: Annotated[int, click.IntRange(0, 65535)] = 0,
+    browser: bool = True,
+    light: Light,
 ):
     """Change sensor distance, curvature, aperture, pitch, depths and field of DESIGN by sliders in a browser.
 
@@ -97,13 +98,19 @@ def explore_command(
     It compares and saves designs. Only this machine can open it; Ctrl-C ends it.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+
+    Options:
+        study: STUDY.toml whose targets are evaluated, as in `gs-jax optimize`.
+        output: NEW.toml to save to; a number is added if it exists. [default: NAME-new.toml]
+        terms: FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.
+        port: Port of the page; 0 takes a free one.
+        browser: Open the page in a browser.
     """
     import webbrowser
 
     from ..apps.explore.server import Server, Session
     from ..codesign.study import read_study
     from ..codesign.terms import add_terms
-    from ..design.design import read_design
 
     if terms and not study:
         raise InputError("--terms must be used with --study, which names them.")
@@ -111,7 +118,7 @@ def explore_command(
         add_terms(terms)
     saves = output or Path(f"{design.stem}-new.toml")
     check_output(saves, [".toml"])
-    microscope, targets = light.design(read_design(design)), read_study(study) if study else None
+    microscope, targets = light.read_design(design), read_study(study) if study else None
     with Progress() as progress:
         with progress.step("Compiling"):
             session = Session(microscope, targets, saves, provenance_of(design, study, terms))
@@ -123,10 +130,13 @@ def explore_command(
         server.serve_forever()
 
 
-@click.command("demo", epilog="Example: gs-jax demo --out demo")
-@click.option("--out", type=Path, default=Path("gs-jax-demo"), help="Folder to write to.")
-def demo_command(out: Path):
-    """Run the whole pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
+@command("demo", "Example: gs-jax demo --out demo")
+def demo_command(*, out: Path = Path("gs-jax-demo")):
+    """Run the whole pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports.
+
+    Options:
+        out: Folder to write to.
+    """
     from ..apps.example_pipeline import run
 
     with Progress() as progress:
@@ -135,10 +145,13 @@ def demo_command(out: Path):
     click.echo(f"{report.with_suffix('.html')}: the microscope and its results, in a browser")
 
 
-@click.command("benchmark", epilog="Example: gs-jax benchmark --out benchmark")
-@click.option("--out", type=Path, default=Path("gs-jax-benchmark"), help="Folder to write to.")
-def benchmark_command(out: Path):
-    """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
+@command("benchmark", "Example: gs-jax benchmark --out benchmark")
+def benchmark_command(*, out: Path = Path("gs-jax-benchmark")):
+    """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9).
+
+    Options:
+        out: Folder to write to.
+    """
     from ..apps.benchmark_report import write, write_records
     from ..apps.method_benchmark import run
 

@@ -1,231 +1,260 @@
-"""`gs-jax reconstruct` for recordings: all frames to one OME-Zarr."""
+"""`gs-jax reconstruct` for recordings, and for the captures of a watched folder: all frames to one OME-Zarr."""
 
 import atexit
 import hashlib
+import sys
 import time
 import warnings
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
+import numpy as np
 
 from ..base.errors import InputError, InputWarning
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
-from .command import RESUMABLE, partial_outputs, provenance_of
-from .light import objects_in
-from .options import UM, CaptureOptions, Number, depth_range
+from .command import RESUMABLE, OptionGroup, partial_outputs, plural, print_warning, provenance_of
+from .options import CaptureOptions, Number, Um, objects_in, voxels
 
 # Failed frames that are named; others are only counted, and listed in the journal.
-MAX_NAMED = 10
+_MAX_NAMED = 10
 # Options that do not change the volumes.
 _OTHER_OPTIONS = ("capture", "design", "output", "points", "track", "resume", "watch", "force", "workers", "scheduler")
+# The table of points is written again after this multiple of the time that it took last, and seconds at least.
+_SHARE, _PAUSE = 20, 1.0
+# Seconds for which a thread keeps the interpreter: a tenth of the default, so that threads wait shorter for each other.
+_SWITCH = 5e-4
 
 
-def recording_options(command):
-    """Add the options of recordings."""
-    interval = click.option(
-        "--frame-interval",
-        type=Number(1e-9, 1e9, "s"),
-        help="Recordings: seconds between frames, the scale of the time axis.  [default: unknown]",
-    )
-    resume = click.option(
-        "--resume",
-        is_flag=True,
-        help="Recordings: keep the frames that an interrupted run left in VOLUME.zarr, if any, and make the others. "
-        "Without it, only --force replaces an unfinished VOLUME.zarr.",
-    )
-    track = click.option(
-        "--track",
-        type=UM,
-        help="Recordings with --points: largest displacement of a particle between frames, um; POINTS.csv gets a "
-        "column of particle numbers. Needs pip install 'gs-jax[track]'.",
-    )
-    watch = click.option(
-        "--watch",
-        is_flag=True,
-        help="CAPTURE is a folder into which a camera writes: reconstruct each capture as it comes, the newest first, "
-        "to VOLUME.zarr, until Ctrl-C. Needs pip install 'gs-jax[live]'.",
-    )
-    warm = click.option(
-        "--warm-start",
-        is_flag=True,
-        default=None,
-        help="Recordings by list-rl or richardson-lucy: start each frame from the volume of the one before, and "
-        "take only the steps that it needs.",
-    )
-    return watch(interval(track(warm(resume(command)))))
+@dataclass
+class RecordingOptions(OptionGroup):
+    """Options of recordings.
 
-
-def check_recording(capture: Path, recording, output: Path, *, resume: bool, given: dict[str, Any], force: bool):
-    """Raise `InputError` if the output cannot hold a recording, or `given` are options of recordings without one."""
-    from ..io.names import first_gap
-    from ..io.volume_series import check_replaceable
-
-    if recording is None:
-        if option := next((name for name, value in given.items() if value), None):
-            raise InputError(f"{option} must be used with a recording, got a single capture {capture}.")
-        return
-    if output.suffix.lower() != ".zarr":
-        count = len(recording.names)
-        if recording.files == [capture]:
-            raise InputError(
-                f"{capture} must be one image, got {count} pages: choose one by --page 1 to {count}, average them by "
-                "--page mean, or reconstruct all with -o VOLUME.zarr."
-            )
-        raise InputError(f"-o must be VOLUME.zarr, which has a time axis, for {count} frames, got {output}.")
-    if not (resume or force):
-        check_replaceable(output)
-    if (given["--frame-interval"] or given["--track"]) and (gap := first_gap(recording.names)):
-        text = (
-            f"{capture}: captures are missing between {gap[0]} and {gap[1]}; frames are taken as evenly spaced in time"
-        )
-        warnings.warn(InputWarning(f"{text}."), stacklevel=2)
-
-
-def open_frames(capture: Path, camera: CaptureOptions, plan):
-    """`frames_of` a recording that stays open until the process ends; for workers."""
-    from ..io.recordings import open_recording
-
-    stack = ExitStack()
-    atexit.register(stack.close)
-    return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
-
-
-def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False):
-    """Prepare a recording and a `Plan`; return `read` and `make` of `reconstruct_frames`.
-
-    `is_live` compiles all before the first frame comes.
+    Options:
+        watch: CAPTURE is a folder into which a camera writes: reconstruct each capture as it comes, the newest first,
+            to VOLUME.zarr, until Ctrl-C. Needs pip install 'gs-jax[live]'.
+        frame_interval: Recordings: seconds between frames, the scale of the time axis. [default: unknown]
+        track: Recordings with --points: largest displacement of a particle between frames, um; POINTS.csv gets a
+            column of particle numbers. Needs pip install 'gs-jax[track]'.
+        warm_start: Recordings by list-rl or richardson-lucy: start each frame from the volume of the one before, and
+            take only the steps that it needs.
+        resume: Recordings: keep the frames that an interrupted run left in VOLUME.zarr, if any, and make the others.
+            Without it, only --force replaces an unfinished VOLUME.zarr.
     """
-    import numpy as np
 
-    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
-    if is_live:
-        with suppress(InputError):
-            reconstruct(_image_to_compile_for(plan), Progress())
-    # Only the first frame is checked; an iterator gives one item to one thread.
-    checks = iter([plan.check] if plan.is_learned else [])
-
-    def make(frame, last):
-        number, image, done, warnings = frame
-        result = reconstruct(image, Progress(), last)
-        if result.warning:
-            warnings = [*warnings, result.warning]
-        note: dict[str, Any] = {name: lines for name, lines in (("done", done), ("warnings", warnings)) if lines}
-        for check in checks:
-            words = residual_in_words(check(result.volume, image, Progress()))
-            note["check"] = f"frame {number} imaged again is {words}"
-        if result.points is not None:
-            points = np.asarray(result.points).T
-            columns = dict(zip(("x_mm", "y_mm", "z_mm", "intensity"), points, strict=True)) | (result.statistics or {})
-            note["points"] = {name: np.asarray(values).tolist() for name, values in columns.items()}
-        return result.volume, note, result.last
-
-    return lambda frame: (frame, *image_of(frame)), make
+    watch: bool = False
+    frame_interval: Annotated[float, Number(1e-9, 1e9, "s")] | None = None
+    track: Um | None = None
+    warm_start: bool | None = None
+    resume: bool = False
 
 
-def _image_to_compile_for(plan):
-    """An image for which all is compiled that captures need: dark, or of points where points are found."""
-    import numpy as np
+@dataclass
+class SeriesRun:
+    """A run that makes the volumes of a recording, or of the captures that come into a folder.
 
-    if not plan.points and plan.suppress == "none":
-        return np.zeros(plan.imager.sensor.shape, np.float32)
-    from ..simulation.phantoms import random_points
-    from ..simulation.synthetic import simulate
+    `plan` is a `Plan`, `frame` a `DepthFrame`. `single` are values of the options of single captures, by name.
+    """
 
-    depths, side = np.asarray(plan.grid.depths, float), float(plan.imager.field_radius)
-    points = random_points(10, (side, side), (depths.min(), depths.max()), seed=0)
-    return np.asarray(simulate(points, plan.imager, optics="near", psf="geometric"), np.float32)
+    capture: Path
+    output: Path
+    points: Path | None
+    plan: Any
+    camera: CaptureOptions
+    frame: Any
+    design_text: str
+    options: RecordingOptions
+    workers: Workers
+    force: bool
+    single: dict[str, Any]
+
+    def check(self, recording) -> bool:
+        """Return whether there is a recording, or a folder to watch.
+
+        Raises `InputError` if the output cannot hold one, or options of recordings are given without one.
+        """
+        from ..io.names import first_gap
+        from ..io.volume_series import check_replaceable
+
+        options, is_series = self.options, recording is not None or self.options.watch
+        if not is_series:
+            given = {
+                "--resume": options.resume,
+                "--frame-interval": options.frame_interval,
+                "--track": options.track,
+                "--warm-start": options.warm_start,
+                "--workers or --scheduler": self.workers.remote,
+            }
+            if option := next((name for name, value in given.items() if value), None):
+                raise InputError(f"{option} must be used with a recording, got a single capture {self.capture}.")
+            return False
+        if self.output.suffix.lower() != ".zarr":
+            if recording is None:
+                raise InputError(f"-o must be VOLUME.zarr, which grows in time, with --watch, got {self.output}.")
+            count = len(recording.names)
+            if recording.files == [self.capture]:
+                raise InputError(
+                    f"{self.capture} must be one image, got {count} pages: choose one by --page 1 to {count}, average "
+                    "them by --page mean, or reconstruct all with -o VOLUME.zarr."
+                )
+            raise InputError(f"-o must be VOLUME.zarr, which has a time axis, for {count} frames, got {self.output}.")
+        if recording is None and self.workers.remote:
+            raise InputError(
+                "--workers and --scheduler must not be given with --watch, which makes one volume at a time."
+            )
+        if option := next((name for name, value in self.single.items() if value), None):
+            got = "--watch" if recording is None else f"{len(recording.names)} frames"
+            raise InputError(f"{option} must be used with a single capture, got {got}.")
+        if not (options.resume or self.force):
+            check_replaceable(self.output)
+        if recording and (options.frame_interval or options.track) and (gap := first_gap(recording.names)):
+            text = f"captures are missing between {gap[0]} and {gap[1]}; frames are taken as evenly spaced in time"
+            warnings.warn(InputWarning(f"{self.capture}: {text}."), stacklevel=2)
+        return True
+
+    def reconstruct(self, recording, progress: Progress) -> int:
+        """Make and write all frames, print a summary, and return the exit status: 1 if a frame failed."""
+        from ..io.volumes import plain_depths
+        from ..reconstruction.recording import reconstruct_frames, reconstruct_frames_by
+
+        if self.workers.remote:
+            self.camera.frames(recording)  # reads the correction, which is printed below; workers read their own
+            opened = partial(_open_frames, self.capture, self.camera, self.plan)
+            run = partial(reconstruct_frames_by, self.workers, open_frames=opened)
+        else:
+            read, make = _frames_of(recording, self.camera, self.plan)
+            run = partial(reconstruct_frames, read=read, make=make)
+        names = recording.names
+        series = self._open_series(names)
+        partial_outputs[self.output] = RESUMABLE
+        before, start, failed = len(series.finished), time.monotonic(), []
+        # Printed when a frame succeeds: if all fail, the error says the reason once.
+        messages = []
+
+        def on_failure(number: int, reason: str) -> None:
+            failed.append(number)
+            if len(failed) <= _MAX_NAMED:
+                messages.append(f"gs-jax: frame {number} ({names[number]}): {reason}")
+            if series.finished:
+                print_messages()
+
+        def print_messages() -> None:
+            while messages:
+                click.echo(messages.pop(0), err=True)
+
+        run(series, on_failure=on_failure, progress=progress)
+        print_messages()
+        seconds, new = time.monotonic() - start, len(series.finished) - before
+        lines = [f"{self.points}: {self._write_points(series)}"] if self.points else []
+        self.camera.print_corrections()
+        if check := _print_notes(series):
+            lines.insert(0, f"{self.output}: {check}")
+        shape, depths = (series.count, *self.plan.grid.volume_shape), plain_depths(self.frame.grid(self.plan.grid))
+        rest = f"; {before} were there" if before else ""
+        rate = (
+            f"{new} frames in {seconds:.3g} s, {new / seconds:.3g} frames/s{rest}" if new else "all frames were there"
+        )
+        text = voxels(shape, "t, z, y, x", self.plan.grid.pitch, depths, self.plan.imager)
+        for line in (f"{self.output}: {text}", f"{self.output}: {rate}", *lines):
+            click.echo(line)
+        if series.failed:
+            numbers = ", ".join(map(str, sorted(series.failed)[:_MAX_NAMED]))
+            numbers += ", ..." if len(series.failed) > _MAX_NAMED else ""
+            text = f"{len(series.failed)} of {series.count} frames failed and are empty: {numbers}"
+            click.echo(f"gs-jax: {self.output}: {text}; --resume tries them again", err=True)
+        return int(bool(series.failed))
+
+    def watch(self, progress: Progress) -> None:
+        """Make a volume of each capture that comes, until an interrupt, and print a summary."""
+        from ..io.captures import read_images
+        from ..io.recordings import Recording, WatchedFolder
+        from ..reconstruction.recording import reconstruct_live
+
+        folder, series = self.capture, self._open_series(None)
+
+        def images(index, selection):
+            return read_images(folder / series.names[index], selection._replace(page=self.camera.page))
+
+        watched = WatchedFolder(folder)
+        with progress.step("Preparing"):
+            read, make = _frames_of(Recording(series.names, images, []), self.camera, self.plan, is_live=True)
+        partial_outputs[self.output] = RESUMABLE
+        state = _State(len(series.finished))
+        table = _Table(partial(self._write_points, series)) if self.points else None
+
+        def changes(timeout: float) -> list[str]:
+            if table:
+                table.write_if_due(len(series.finished))
+            return watched.changes(timeout)
+
+        def on_failure(number: int, reason: str) -> None:
+            state.failures += 1
+            if state.failures <= _MAX_NAMED:
+                click.echo(f"gs-jax: frame {number} ({series.names[number]}): {reason}", err=True)
+
+        click.echo(f"{folder}: watched until Ctrl-C, {objects_in(self.plan.imager)}", err=True)
+        before, _ = sys.getswitchinterval(), sys.setswitchinterval(_SWITCH)
+        try:
+            with watched, progress.counter("Reconstructing", None, rate="frames", words=state.text) as advance:
+
+                def on_done(done) -> None:
+                    state.delays.append(done.delay)
+                    state.waiting = done.waiting
+                    advance()
+
+                reconstruct_live(series, folder, changes, read, make, on_failure=on_failure, on_done=on_done)
+        finally:
+            sys.setswitchinterval(before)
+            if table:
+                table.write()
+            self.camera.print_corrections()
+            _print_notes(series)
+            for line in state.summary(series):
+                click.echo(f"{self.output}: {line}")
+
+    def _open_series(self, names: list[str] | None):
+        """Open the volumes of frames of these names, or of captures that are to come."""
+        from ..io.names import plain_text
+        from ..io.provenance import input_key
+        from ..io.volume_series import VolumeSeries
+
+        provenance = provenance_of(self.plan.weights, *self.camera.files, design=self.design_text)
+        request = _request_of(provenance, names)
+        source = f"{len(names)} frames, {names[0]} to {names[-1]}" if names else "a folder, as captures came"
+        provenance = self.camera.recorded(provenance | {input_key(self.capture): plain_text(source)})
+        self.provenance = provenance | (self.frame.note if self.plan.imager.sample is not None else {})
+        options = {"interval": self.options.frame_interval, "resume": self.options.resume, "request": request}
+        count, grid = len(names) if names else None, self.frame.grid(self.plan.grid)
+        return VolumeSeries(self.output, count, grid, **options, provenance=self.provenance)
+
+    def _write_points(self, series) -> str:
+        """Write the points of all frames; return their number, and that of particles, as text."""
+        from ..detection.particles import track
+        from ..io.point_tables import write_points_in_time
+        from ..io.provenance import INTENSITY
+
+        points, particles = [0], [0]
+
+        def count(frames) -> Iterator[tuple[int, dict[str, Any]]]:
+            for number, columns in frames:
+                points.append(len(columns["x_mm"]))
+                particles[0] = max([*particles, *(1 + particle for particle in columns.get("particle", ()))])
+                yield number, columns
+
+        frames = ((number, self.frame.columns(note["points"])) for number, note in series.notes())
+        if self.options.track:
+            frames = track(frames, self.options.track / 1000)
+        write_points_in_time(self.points, count(frames), provenance=self.provenance | INTENSITY)
+        text = plural(sum(points), "point")
+        return f"{text} of {plural(particles[0], 'particle')}" if self.options.track else text
 
 
-def reconstruct_recording(
-    recording,
-    plan,
-    output: Path,
-    *,
-    design_text: str,
-    capture: Path,
-    camera: CaptureOptions,
-    progress: Progress,
-    points: Path | None,
-    track: float | None,
-    interval: float | None,
-    resume: bool,
-    workers: Workers,
-    frame,
-) -> int:
-    """Make and write all frames, print a summary, and return the exit status: 1 if a frame failed."""
-    from ..io.names import plain_text
-    from ..io.provenance import input_key
-    from ..io.volume_series import VolumeSeries
-    from ..io.volumes import plain_depths
-    from ..reconstruction.recording import reconstruct_frames, reconstruct_frames_by
-
-    if workers.remote:
-        camera.frames(recording)  # reads the correction, which is printed below; workers read their own
-        run = partial(reconstruct_frames_by, workers, open_frames=partial(open_frames, capture, camera, plan))
-    else:
-        read, make = frames_of(recording, camera, plan)
-        run = partial(reconstruct_frames, read=read, make=make)
-    names = recording.names
-    provenance = provenance_of(plan.weights, *camera.files, design=design_text)
-    request = request_of(provenance, names)
-    provenance[input_key(capture)] = plain_text(f"{len(names)} frames, {names[0]} to {names[-1]}")
-    provenance = camera.recorded(provenance)
-    provenance |= frame.note if plan.imager.sample is not None else {}
-    grid = frame.grid(plan.grid)
-    described = {"interval": interval, "request": request, "provenance": provenance}
-    series = VolumeSeries(output, len(names), grid, **described, resume=resume)
-    partial_outputs[output] = RESUMABLE
-    before, began = len(series.finished), time.monotonic()
-    # Printed when a frame succeeds: if all fail, the error says the reason once.
-    messages, failures = [], 0
-
-    def on_failure(frame, reason):
-        nonlocal failures
-        failures += 1
-        if failures <= MAX_NAMED:
-            messages.append(f"gs-jax: frame {frame} ({names[frame]}): {reason}")
-        if series.finished:
-            print_messages()
-
-    def print_messages():
-        while messages:
-            click.echo(messages.pop(0), err=True)
-
-    run(series, on_failure=on_failure, progress=progress)
-    print_messages()
-    seconds, new = time.monotonic() - began, len(series.finished) - before
-    written = write_series_points(points, series, track, provenance, frame) if points else ""
-    camera.print_corrections()
-    check = print_notes(series)
-    size = " x ".join(map(str, (series.count, *plan.grid.volume_shape)))
-    rest = f"; {before} were there" if before else ""
-    rate = f"{new} frames in {seconds:.3g} s, {new / seconds:.3g} frames/s{rest}" if new else "all frames were there"
-    voxels = f"{size} voxels (t, z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
-    click.echo(f"{output}: {voxels}, {depth_range(plain_depths(grid))}, {objects_in(plan.imager)}")
-    click.echo(f"{output}: {rate}")
-    if check:
-        click.echo(f"{output}: {check}")
-    if points:
-        click.echo(f"{points}: {written}")
-    if series.failed:
-        numbers = ", ".join(map(str, sorted(series.failed)[:MAX_NAMED]))
-        numbers += ", ..." if len(series.failed) > MAX_NAMED else ""
-        failed = f"{len(series.failed)} of {series.count} frames failed and are empty: {numbers}"
-        click.echo(f"gs-jax: {output}: {failed}; --resume tries them again", err=True)
-    return int(bool(series.failed))
-
-
-def residual_in_words(residual) -> str:
-    """A `ForwardResidual` in words."""
-    error = f"{residual.error:.0%} RMS from the capture (correlation {residual.correlation:.3f})"
-    return f"{error}, {residual.regions.max():.0%} where it is farthest"
-
-
-def request_of(provenance: dict[str, str], names: list[str] | None = None) -> dict[str, str]:
+def _request_of(provenance: dict[str, str], names: list[str] | None) -> dict[str, str]:
     """What the volumes depend on: options, the design, and the contents of the files beside the recording."""
     options = click.get_current_context().params
     request = {name: str(value) for name, value in options.items() if name not in _OTHER_OPTIONS and value is not None}
@@ -236,30 +265,67 @@ def request_of(provenance: dict[str, str], names: list[str] | None = None) -> di
     return request
 
 
-def write_series_points(path, series, track, provenance, frame) -> str:
-    """Write the points of all frames; return their number, and that of particles, in words."""
-    from ..detection.linking import track as track_particles
-    from ..io.point_tables import write_points_in_time
-    from ..io.provenance import INTENSITY
+def _open_frames(capture: Path, camera: CaptureOptions, plan):
+    """`_frames_of` a recording that stays open until the process ends; for workers."""
+    from ..io.recordings import open_recording
 
-    points, particles = 0, 0
-
-    def count(frames):
-        nonlocal points, particles
-        for number, columns in frames:
-            points += len(columns["x_mm"])
-            particles = max([particles, *(1 + particle for particle in columns.get("particle", ()))])
-            yield number, columns
-
-    frames = ((number, frame.columns(note["points"])) for number, note in series.notes())
-    if track:
-        frames = track_particles(frames, track / 1000)
-    write_points_in_time(path, count(frames), provenance=provenance | INTENSITY)
-    words = f"{points} point{'s' * (points != 1)}"
-    return f"{words} of {particles} particle{'s' * (particles != 1)}" if track else words
+    stack = ExitStack()
+    atexit.register(stack.close)
+    return _frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
 
 
-def print_notes(series) -> str:
+def _frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False):
+    """Prepare a recording and a `Plan`; return `read` and `make` of `reconstruct_frames`.
+
+    `is_live` compiles all before the first frame comes.
+    """
+    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
+    if is_live:
+        with suppress(InputError):
+            reconstruct(_image_to_compile_for(plan), Progress())
+    # Only the first frame is checked; an iterator gives one item to one thread.
+    checks = iter([plan.check] if plan.is_learned else [])
+
+    def read(frame):
+        return frame, *image_of(frame)
+
+    def make(frame, last):
+        number, image, done, warnings = frame
+        result = reconstruct(image, Progress(), last)
+        if result.warning:
+            warnings = [*warnings, result.warning]
+        note: dict[str, Any] = {name: lines for name, lines in (("done", done), ("warnings", warnings)) if lines}
+        for check in checks:
+            text = format_residual(check(result.volume, image, Progress()))
+            note["check"] = f"frame {number} imaged again is {text}"
+        if result.points is not None:
+            points = np.asarray(result.points).T
+            columns = dict(zip(("x_mm", "y_mm", "z_mm", "intensity"), points, strict=True)) | (result.statistics or {})
+            note["points"] = {name: np.asarray(values).tolist() for name, values in columns.items()}
+        return result.volume, note, result.last
+
+    return read, make
+
+
+def _image_to_compile_for(plan):
+    """An image for which all is compiled that captures need: dark, or of points where points are found."""
+    if not plan.points and plan.suppress == "none":
+        return np.zeros(plan.imager.sensor.shape, np.float32)
+    from ..simulation.phantoms import random_points
+    from ..simulation.synthetic import simulate
+
+    depths, side = np.asarray(plan.grid.depths, float), float(plan.imager.field_radius)
+    points = random_points(10, (side, side), (depths.min(), depths.max()), seed=0)
+    return np.asarray(simulate(points, plan.imager, optics="near", psf="geometric"), np.float32)
+
+
+def format_residual(residual) -> str:
+    """A `ForwardResidual` as text."""
+    error = f"{residual.error:.0%} RMS from the capture (correlation {residual.correlation:.3f})"
+    return f"{error}, {residual.regions.max():.0%} where it is farthest"
+
+
+def _print_notes(series) -> str:
     """Print how many frames were corrected or have warnings, with the first warning; return the check."""
     from ..io.volume_series import JOURNAL
 
@@ -271,7 +337,55 @@ def print_notes(series) -> str:
         check = check or note.get("check", "")
     if done:
         where = f"{JOURNAL} in {series.path} has their numbers"
-        click.echo(f"{done} frame{'s' * (done > 1)}: pixels filled from neighbours; {where}")
+        click.echo(f"{plural(done, 'frame')}: pixels filled from neighbours; {where}")
     if warned:
-        click.echo(f"gs-jax: warning: in {warned} frame{'s' * (warned > 1)}, the first: {first}", err=True)
+        print_warning(f"in {plural(warned, 'frame')}, the first: {first}")
     return check
+
+
+class _State:
+    """Delays of the volumes of this run, seconds, and the number of captures that wait."""
+
+    def __init__(self, before: int):
+        self.before, self.delays, self.waiting, self.failures = before, [], 0, 0
+
+    def text(self) -> str:
+        late = f"delay {_format_delay(self.delays[-1])}" if self.delays else "no capture yet"
+        return f"{late}, {self.waiting} waiting"
+
+    def summary(self, series) -> list[str]:
+        new, missing = len(self.delays), series.count - len(series.finished)
+        rest = f"; {self.before} were there" if self.before else ""
+        lines = [f"{plural(new, 'frame')} of {series.count}{rest}"]
+        if new:
+            middle, most = map(_format_delay, np.percentile(self.delays, (50, 95)))
+            lines.append(f"from a capture's last byte to its volume: {middle} at the median, {most} in 95 %")
+        if missing:
+            # A bad capture that replaced a good one has the volume of that.
+            bad = len(series.failed.keys() - series.finished)
+            failed = f", {bad} failed" if bad else ""
+            which, it = ("capture has", "it") if missing == 1 else ("captures have", "them")
+            lines.append(f"{missing} {which} no volume{failed}; --resume makes {it}")
+        return lines
+
+
+def _format_delay(seconds: float) -> str:
+    return f"{1000 * seconds:.0f} ms" if seconds < 10 else f"{seconds:.0f} s"
+
+
+class _Table:
+    """The table of points, written again while frames come, but in a small part of the time."""
+
+    def __init__(self, write: Callable[[], object]):
+        self._write, self._next, self._frames = write, 0.0, 0
+
+    def write_if_due(self, frames: int) -> None:
+        if frames > self._frames and time.monotonic() >= self._next:
+            self._frames = frames
+            self.write()
+
+    def write(self) -> None:
+        start = time.monotonic()
+        self._write()
+        end = time.monotonic()
+        self._next = end + max(_PAUSE, _SHARE * (end - start))

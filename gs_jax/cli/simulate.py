@@ -2,64 +2,54 @@
 
 import math
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
-from .command import check_may_write, provenance_of
-from .light import Light, ask_for_unit, check_beyond, light_options, objects_in
-from .options import DESIGN, PSFS, SIMULATED, Number, given_options
+from .command import check_may_write, command, given_options, provenance_of
+from .options import PSFS, SIMULATED, Counts, DepthLight, DesignPath, Number, Seed, ask_for_unit, objects_in
 
-PEAK = Number(1.0, 1e6, "electrons")
-ELECTRONS = Number(0.0, 1e9, "electrons")
-GAIN = Number(1e-3, 1e6, "electrons")
-WELL = Number(1.0, 1e9, "electrons")
-COUNTS = Number(0.0, 65535.0, "counts")
 # Options of the exposure.
 _CAMERA = ("peak_electrons", "gain", "offset", "read_noise", "full_well", "bits", "seed")
 
 
-@click.command("simulate", epilog="Example: gs-jax simulate points.csv design/geomscope.toml -o capture.tif")
-@click.argument("scene", type=Path)
-@click.argument("design", type=DESIGN)
-@click.option(
-    "--optics",
-    type=click.Choice(SIMULATED),
-    default="full",
-    help="full: all of the light, by ray tracing; near: Eq. (2), with one PSF for all lenses near a point.",
-)
-@click.option("--psf", type=click.Choice(PSFS), help="PSF of --optics near.  [default: diffraction]")
-@click.option("--peak-electrons", type=PEAK, default=1e4, help="Electrons in the brightest pixel.")
-@click.option("--noise/--no-noise", default=True, help="Without noise the capture is float32.")
-@click.option("--gain", type=GAIN, default=10.0, help="Electrons per count.")
-@click.option("--offset", type=COUNTS, default=16.0, help="Counts of a dark pixel.")
-@click.option("--read-noise", type=ELECTRONS, default=2.0, help="Standard deviation, electrons.")
-@click.option("--full-well", type=WELL, help="Largest number of electrons in a pixel.  [default: no limit]")
-@click.option("--bits", type=click.IntRange(1, 16), default=16, help="Bits of the converter.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the noise.")
-@click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
-@light_options
+@command("simulate", "Example: gs-jax simulate points.csv design/geomscope.toml -o capture.tif")
 def simulate_command(
     scene: Path,
-    design: Path,
-    optics: str,
-    psf: str | None,
-    peak_electrons: float,
-    noise: bool,
-    gain: float,
-    offset: float,
-    read_noise: float,
-    full_well: float | None,
-    bits: int,
-    seed: int,
+    design: DesignPath,
+    *,
+    optics: Annotated[str, click.Choice(SIMULATED)] = "full",
+    psf: Annotated[str, click.Choice(PSFS)] | None = None,
+    peak_electrons: Annotated[float, Number(1.0, 1e6, "electrons")] = 1e4,
+    noise: bool = True,
+    gain: Annotated[float, Number(1e-3, 1e6, "electrons")] = 10.0,
+    offset: Counts = 16.0,
+    read_noise: Annotated[float, Number(0.0, 1e9, "electrons")] = 2.0,
+    full_well: Annotated[float, Number(1.0, 1e9, "electrons")] | None = None,
+    bits: Annotated[int, click.IntRange(1, 16)] = 16,
+    seed: Seed = 0,
     output: Path,
-    light: Light,
+    light: DepthLight,
 ):
     """Simulate the capture of SCENE by the microscope of the file DESIGN.
 
     SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr) of uniformly lit voxels.
+
+    Options:
+        optics: full: all of the light, by ray tracing; near: Eq. (2), with one PSF for all lenses near a point.
+        psf: PSF of --optics near. [default: diffraction]
+        peak_electrons: Electrons in the brightest pixel.
+        noise: Without noise the capture is float32.
+        gain: Electrons per count.
+        offset: Counts of a dark pixel.
+        read_noise: Standard deviation, electrons.
+        full_well: Largest number of electrons in a pixel. [default: no limit]
+        bits: Bits of the converter.
+        seed: Seed of the noise.
+        output: CAPTURE.tif, .png or .npy.
     """
     import jax
     import numpy as np
@@ -94,16 +84,17 @@ def simulate_command(
     click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}, {objects_in(imager)}")
 
 
-def _placed(scene: Path, objects, grid, light: Light, imager):
-    """A scene with depths from the array: what says that it counts from the sample is so already."""
+def _placed(scene: Path, objects, grid, light: DepthLight, imager):
+    """A scene with depths from the array: a file that says that it counts from the sample was moved when read."""
     import numpy as np
 
+    from ..geometry import check_beyond
     from ..io.provenance import frame_of
 
-    origin, said = light.origin(imager), frame_of(scene)
-    if origin is not None and said == "array":
+    origin, declared = light.origin(imager), frame_of(scene)
+    if origin is not None and declared == "array":
         raise InputError("--depths-from must be array, as SCENE says that its depths count from there, got sample.")
-    moved = (origin or 0.0) if said is None else 0.0
+    moved = (origin or 0.0) if declared is None else 0.0
     if grid is None:
         ask_for_unit(scene, objects)
         objects = objects + np.array([0, 0, moved, 0])

@@ -275,11 +275,12 @@ def summary(design: Design, sheet: dict[str, Any]) -> str:
 
 
 def overview(design: Design, sheet: dict[str, Any], *, circle_of_confusion: float | None = None) -> list[str]:
-    """The size of a point's image, focus and overlap over the depths of a datasheet, a line each."""
+    """The light's path, the emission band, and over the depths a point's image, focus and overlap, a line each."""
     ends = lambda key: _ends(value for value in sheet[key] if value is not None)
     depths, limit = sheet["depth_mm"], 1000 * circle_of_confusion_of(design, circle_of_confusion)
     blurred = sum(blur > limit for blur in sheet["blur_um"])
     return [
+        *filter(None, (path_in_words(sheet), band_in_words(sheet))),
         f"a point at {_ends(depths)} mm, seen in the object: FWHM {ends('fwhm_um')} um on the axis, half of the light "
         f"within {ends('half_light_radius_um')} um, RMS width {ends('rms_width_um')} um; Eq. 5 promises "
         f"{ends('lateral_resolution_um')} um, Eq. 6 {ends('axial_resolution_um')} um along z",

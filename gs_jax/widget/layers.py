@@ -83,7 +83,7 @@ def prepare_layers(
     def reconstruct(name: str, capture: Path | np.ndarray) -> Result:
         with progress.step("Reading"):
             if isinstance(capture, Path):
-                camera = CaptureOptions(dark=None, flat=None, bad_pixels="auto", offset=0.0)
+                camera = CaptureOptions()
                 camera.imager(imager)
                 image, warnings = camera.read(capture), list(camera.warnings)
             else:
