@@ -8,8 +8,8 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.files import check_output, side_file
-from .command import check_may_write, command, provenance_of
+from ..io.files import side_file
+from .command import check_outputs, command, provenance_of
 from .options import CaptureOptions, DepthLight, DesignPath, ask_for_unit
 
 # Names of quantities, of which the first four are always fitted.
@@ -78,7 +78,6 @@ def calibrate_command(
         pattern: Capture with one image of every lens, sharp or not: of a far source, or of an even white surface.
             Alone, it fits rotation, shift and scale of the lenses' pattern; with CAPTURES, scale beside the rest.
         output: CALIBRATED.toml; a picture of the residuals, CALIBRATED.toml.png, is written beside it.
-        force: Replace existing .toml and .csv files.
     """
     import numpy as np
     from rich.console import Console
@@ -102,11 +101,10 @@ def calibrate_command(
         raise InputError(
             "calibrate needs captures with --positions POINTS.csv, or a --pattern, or one capture with --from-scene."
         )
-    check_output(output, [".toml"])
-    drawing = check_output(side_file(output, ".png"), [".png"])
+    drawing = side_file(output, ".png")
     pictures = (*captures, *([pattern] if pattern else []))
     inputs = (design, *pictures, *([positions] if positions else []), *camera.files)
-    check_may_write(output, drawing, inputs=inputs, force=force)
+    check_outputs(output, [".toml"], drawing, inputs=inputs, force=force)
     microscope = read_design(design)
     fitted = SELF_FITTED if from_scene else FITTED if captures else PATTERN_FITTED
     names = [name for name in (*fitted, *(["scale"] if pattern else []), *fit) if name not in hold]

@@ -16,6 +16,7 @@ from click.core import ParameterSource
 
 from ..base.errors import InputError
 from ..base.progress import QUIET, VERBOSE, verbosity
+from ..io.files import check_output
 
 # Files that people write by hand: designs, studies, points and centres.
 _WRITTEN_BY_HAND = (".toml", ".csv")
@@ -24,6 +25,14 @@ ARGUMENTS = "gs_jax.arguments"
 # Files to name after an interrupt, with a text about each.
 partial_outputs: dict[Path, str] = {}
 RESUMABLE, PARTIAL = "has what is done, and --resume goes on from it", "has what is done"
+
+
+# Help of options that are the same in all commands.
+_HELP = {
+    "force": "Replace existing .toml and .csv files.",
+    "terms": "FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.",
+    "out": "Folder to write to.",
+}
 
 
 class OptionGroup:
@@ -81,7 +90,7 @@ def _documentation(documented: Any) -> tuple[str, dict[str, str]]:
 
 def _parameters(documented: Any) -> Iterator[click.Parameter]:
     """Yield the arguments and options of a function or an `OptionGroup`."""
-    texts = _documentation(documented)[1]
+    texts = _HELP | _documentation(documented)[1]
     for parameter in inspect.signature(documented).parameters.values():
         if _is_group(parameter.annotation):
             yield from _parameters(parameter.annotation)
@@ -140,6 +149,22 @@ def given_options(names: Iterable[str]) -> list[str]:
     return [f"--{name.replace('_', '-')}" for name in names if source(name) is ParameterSource.COMMANDLINE]
 
 
+def check_outputs(
+    output: Path | None,
+    suffixes: Sequence[str],
+    *beside: Path,
+    inputs: Iterable[Path | None] = (),
+    force: bool = False,
+) -> None:
+    """Check an output, and the files beside it, by `check_output` and `check_may_write`; None is no output."""
+    if output is None:
+        return
+    check_output(output, suffixes)
+    for path in beside:
+        check_output(path, [path.suffix])
+    check_may_write(output, *beside, inputs=inputs, force=force)
+
+
 def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force: bool = False) -> None:
     """Check the outputs before any work; when the command succeeds, report on standard error what was replaced.
 
@@ -172,13 +197,14 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
     click.get_current_context().call_on_close(report)
 
 
-def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:
-    """Provenance of the running command's outputs: command line, inputs, and the text of the design."""
+def provenance_of(*inputs: Path | None, design: Any = None) -> dict[str, str]:
+    """Provenance of the running command's outputs: command line, inputs, and the text of a `Design`."""
+    from ..design.design import design_text
     from ..io.provenance import made_by
 
     context = click.get_current_context()
     arguments = shlex.join(["gs-jax", *context.meta.get(ARGUMENTS, [context.info_name])])
-    return made_by(arguments, [path for path in inputs if path is not None], design)
+    return made_by(arguments, [path for path in inputs if path is not None], design_text(design) if design else "")
 
 
 def print_warning(text: str) -> None:

@@ -8,7 +8,7 @@ import click
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
-from .command import OptionGroup, check_may_write, command, given_options, print_warning, provenance_of
+from .command import OptionGroup, check_outputs, command, given_options, print_warning, provenance_of
 from .options import Binning, Depths, Number, Page, PictureOptions, Steps, Um, check_even, depth_range
 
 _METHODS = ("admm", "fista", "richardson-lucy", "wiener")
@@ -89,15 +89,13 @@ def deconvolve_command(
     import numpy as np
 
     from ..io.captures import write_capture
-    from ..io.files import check_output
     from ..io.recordings import spot_names
     from ..io.volumes import STACK_SUFFIXES, write_planes
     from ..reconstruction.deconvolution import bin_pixels, filter_image, make_solver, pad_to_largest, run_deconvolution
     from ..reconstruction.field_fit import fit_field
 
-    check_output(output, STACK_SUFFIXES)
     files = [path for path in (*psf, psf_places, *camera.files) if path]
-    check_may_write(output, inputs=(capture, *files))
+    check_outputs(output, STACK_SUFFIXES, inputs=(capture, *files))
     places, solver = None, None
     if method != "wiener":
         solver = make_solver(method, steps, vars(weights))

@@ -9,8 +9,8 @@ import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..io.files import check_output, checkpoint_path, make_folder, write_json
-from .command import PARTIAL, RESUMABLE, check_may_write, command, partial_outputs, plural, provenance_of
+from ..io.files import checkpoint_path, make_folder, write_json
+from .command import PARTIAL, RESUMABLE, check_outputs, command, partial_outputs, plural, provenance_of
 from .options import DepthList, DesignPath, Light, Mm, Um, WorkerOptions, objects_in, shipped_designs
 
 
@@ -34,13 +34,11 @@ def layout_command(
         diameter_mm: Lens diameter; the lenses cover the plate.
         seed: Seed of the layout.
         output: CENTERS.csv, with the header x_mm,y_mm.
-        force: Replace existing .toml and .csv files.
     """
     from ..design.centers import write_centers
     from ..layouts import coverage, nearest_neighbour_distances, random_layout
 
-    check_output(output, [".csv"])
-    check_may_write(output, inputs=(), force=force)
+    check_outputs(output, [".csv"], force=force)
     centers = random_layout(count, size_mm, pitch=pitch_mm, diameter=diameter_mm, seed=seed)
     write_centers(output, centers, provenance_of())
     distances = nearest_neighbour_distances(centers)
@@ -76,9 +74,7 @@ def metrics_command(
     from ..design.diagnostics import findings
     from ..geometry import check_beyond
 
-    if json:
-        check_output(json, [".json"])
-        check_may_write(json, inputs=(design,))
+    check_outputs(json, [".json"], inputs=(design,))
     circle_of_confusion = confusion_um and confusion_um / 1000
     microscope = light.read_design(design)
     if depths:
@@ -181,20 +177,17 @@ def optimize_command(
 
     Options:
         study: STUDY.toml: free parameters, goals and solvers.
-        terms: FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.
         resume: Continue from the checkpoint of an interrupted run beside NEW.toml.
         output: NEW.toml; numbers and a picture are written beside it.
-        force: Replace existing .toml and .csv files.
     """
     import jax
     from rich.console import Console
 
     from ..codesign import search
-    from ..codesign.search_report import before_and_after, check_outputs, side_files, write_outcome
+    from ..codesign.search_report import before_and_after, side_files, write_outcome
     from ..codesign.terms import add_terms
 
-    check_outputs(output)
-    check_may_write(output, *side_files(output), inputs=(design, study, terms), force=force)
+    check_outputs(output, [".toml"], *side_files(output), inputs=(design, study, terms), force=force)
     # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
     checkpoint = checkpoint_path(output, resume=resume)
@@ -221,10 +214,6 @@ def pareto_command(
     """Compute the trade-off of the file STUDY: its one goal against one or two moving limits.
 
     The folder gets pareto.json, to which each design is added when it is found, and pareto.png.
-
-    Options:
-        out: Folder to write to.
-        terms: FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.
     """
     import jax
     from rich.console import Console
@@ -235,7 +224,7 @@ def pareto_command(
     from ..codesign.study import parent_path, read_study
     from ..codesign.targets import SIGNS
     from ..codesign.terms import add_terms
-    from ..design.design import design_text, read_design
+    from ..design.design import read_design
     from ..io.files import write_figure
     from ..io.provenance import KEY
 
@@ -249,9 +238,9 @@ def pareto_command(
     with errors_name_file(study):
         sweep_of(parent, question)
     make_folder(out)
-    numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
-    check_may_write(numbers, drawing, inputs=(study, start, terms))
-    provenance = provenance_of(study, start, terms, design=design_text(parent))
+    numbers, drawing = out / "pareto.json", out / "pareto.png"
+    check_outputs(numbers, [".json"], drawing, inputs=(study, start, terms))
+    provenance = provenance_of(study, start, terms, design=parent)
 
     def each(front):
         write_json(numbers, {KEY: provenance} | as_json(front))

@@ -2,15 +2,15 @@
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
 from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.files import check_output, side_file, write_json
-from .command import check_may_write, command, given_options, provenance_of
+from ..io.files import side_file, write_json
+from .command import check_outputs, command, given_options, provenance_of
 from .options import DepthList, DesignPath, Light, Number, Seed, Um, objects_in
 
 SmallUm = Annotated[float, Number(1e-3, 1e3, "um")]
@@ -49,16 +49,14 @@ def mold_command(
         layer_um: Thickness of the printer's layers, if any.
         label: Engrave the design's name in the rim.
     """
-    from ..design.design import design_text, read_design
+    from ..design.design import read_design
     from ..mold.export import MESH_SUFFIXES
     from ..mold.make import make_mold, report_text, side_files
     from ..mold.solids import MoldShape
 
-    beside = [check_output(path, [path.suffix]) for path in side_files(output)]
-    check_output(output, MESH_SUFFIXES)
     if positive and (given := given_options(("draft_deg", "headroom_mm"))):
         raise InputError(f"{given[0]} must be used without --positive: it is of the mold's walls.")
-    check_may_write(output, *beside, inputs=(design,))
+    check_outputs(output, MESH_SUFFIXES, *side_files(output), inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
         draft=math.radians(draft_deg),
@@ -73,7 +71,7 @@ def mold_command(
         "resolution": resolution_um / 1000,
         "layer": layer_um and layer_um / 1000,
     }
-    provenance = provenance_of(design, design=design_text(microscope))
+    provenance = provenance_of(design, design=microscope)
     with Progress() as progress, errors_name_file(design):
         report = make_mold(microscope, output, **options, provenance=provenance, progress=progress)
     click.echo(report_text(report), nl=False)
@@ -91,15 +89,14 @@ def mask_command(design: DesignPath, *, output: Path):
         output: MASK.dxf, MASK.svg, or MASK.gds for GDSII.
     """
     from ..design.conversion import AIR
-    from ..design.design import design_text, read_design
+    from ..design.design import read_design
     from ..mold.export import MASK_SUFFIXES, make_mask, write_mask
 
-    check_output(output, MASK_SUFFIXES)
-    check_may_write(output, inputs=(design,))
+    check_outputs(output, MASK_SUFFIXES, inputs=(design,))
     microscope = read_design(design)
     with errors_name_file(design):
         mask = make_mask(microscope.imager(AIR).array)
-    write_mask(output, mask, provenance_of(design, design=design_text(microscope)))
+    write_mask(output, mask, provenance_of(design, design=microscope))
     alone, rings = len(mask.circles), len(mask.openings)
     width, height = mask.outline.max(0) - mask.outline.min(0)
     click.echo(f"{output}: {alone} round openings and {rings} others on a sheet of {width:g} x {height:g} mm")
@@ -117,18 +114,16 @@ def heights_command(design: DesignPath, *, output: Path, step_um: SmallUm = 10.0
     Options:
         output: HEIGHTS.tif (float, mm), .png (16 bits), .xyz (text), .dat (grid sag of OpticStudio); LENSES.csv.
         step_um: Distance of points; not of LENSES.csv.
-        force: Replace existing .toml and .csv files.
     """
-    from ..design.design import design_text, read_design
+    from ..design.design import read_design
     from ..io.provenance import sidecar
     from ..mold.height_files import HEIGHT_SUFFIXES, write_heights
 
-    check_output(output, HEIGHT_SUFFIXES)
+    check_outputs(output, HEIGHT_SUFFIXES, sidecar(output), inputs=(design,), force=force)
     if output.suffix.lower() == ".csv" and given_options(["step_um"]):
         raise InputError(f"--step-um must be used with heights, got the list of lenses {output}.")
-    check_may_write(output, sidecar(output), inputs=(design,), force=force)
     microscope = read_design(design)
-    provenance = provenance_of(design, design=design_text(microscope))
+    provenance = provenance_of(design, design=microscope)
     with Progress() as progress, errors_name_file(design):
         report = write_heights(microscope, output, step=step_um / 1000, provenance=provenance, progress=progress)
     columns, rows = report.get("points", (0, 0))
@@ -193,7 +188,6 @@ def tolerance_command(
     from ..apps.tolerance_analysis import tolerance
     from ..apps.tolerance_report import as_json, picture, sentences, tables
     from ..apps.tolerance_spec import read_tolerances
-    from ..design.design import design_text
     from ..geometry import check_beyond
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
@@ -203,9 +197,7 @@ def tolerance_command(
     jax.config.update("jax_enable_x64", True)
     drawing = output and side_file(output, ".png")
     if output and drawing:
-        check_output(output, [".json"])
-        check_output(drawing, [".png"])
-        check_may_write(output, drawing, inputs=(design, tolerances, positions))
+        check_outputs(output, [".json"], drawing, inputs=(design, tolerances, positions))
     given = {name: value for name, value in values.items() if value is not None}
     chosen = (read_tolerances(tolerances) if tolerances else ToleranceSpec()).model_copy(update=given)
     sources = None
@@ -215,16 +207,22 @@ def tolerance_command(
             raise InputError(f"{positions}: every source must have x, y and z > 0, got one without.")
     microscope = light.read_design(design)
     check_beyond(microscope.imager(), [*(depths or ()), *([] if sources is None else sources[:, 2])], "depths")
-    targets = {
+    targets: dict[str, Any] = {
         "max_width": max_width_um and max_width_um / 1000,
         "min_strehl": min_strehl,
         "max_depth_error": max_depth_error_um and max_depth_error_um / 1000,
     }
     with Progress() as progress, errors_name_file(design):
-        options = {"depths": depths, "sources": sources, "draws": draws, "seed": seed, "progress": progress}
-        result = tolerance(microscope, chosen, **options, **targets)
+        options: dict[str, Any] = {
+            "depths": depths,
+            "sources": sources,
+            "draws": draws,
+            "seed": seed,
+            "progress": progress,
+        }
+        result = tolerance(microscope, chosen, **options, **targets, progress=progress)
     if output and drawing:
-        provenance = provenance_of(design, tolerances, positions, design=design_text(microscope))
+        provenance = provenance_of(design, tolerances, positions, design=microscope)
         write_json(output, {KEY: provenance, "seed": seed} | as_json(result))
         write_figure(drawing, picture(result))
     click.echo(objects_in(microscope.imager()))

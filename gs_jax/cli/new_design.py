@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import click
 
 from ..base.errors import InputError, errors_name_file
-from ..io.files import check_output
-from .command import OptionGroup, check_may_write, command, given_options, print_warning, provenance_of
+from .command import OptionGroup, check_outputs, command, given_options, print_warning, provenance_of
 
 # Keys of the file that are options, in the order of the questions.
 _KEYS = (
@@ -129,14 +128,12 @@ def new_design_command(
         centers: Lens centres: a text table with x and y in each line and any header.
         name: Name in reports. [default: the file's]
         output: MY.toml, with a comment for each key.
-        force: Replace existing .toml and .csv files.
     """
     from ..design.design import checked_design
     from ..design.keys import commented
     from ..io.files import write_text
 
-    check_output(output, [".toml"])
-    check_may_write(output, inputs=(centers,), force=force)
+    check_outputs(output, [".toml"], inputs=(centers,), force=force)
     known = {key: value for key, value in vars(options).items() if value is not None}
     asking = at_terminal()
     _check_together(known, centers, asking)

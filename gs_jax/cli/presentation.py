@@ -9,7 +9,7 @@ import click
 from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
-from .command import PARTIAL, check_may_write, command, given_options, partial_outputs, provenance_of
+from .command import PARTIAL, check_outputs, command, given_options, partial_outputs, provenance_of
 from .options import CAPTURE_OPTIONS, CaptureOptions, DesignPath, Light, objects_in
 
 
@@ -44,18 +44,16 @@ def report_command(
     """
     from ..apps.report.page import write_report
     from ..apps.report.report_tables import read_tolerance
-    from ..design.design import design_text
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
     from ..io.volumes import read_surface, read_volume
 
     inputs = (design, volume, points, surface, capture, tolerance)
-    check_output(output, [".html"])
     if not capture and (given := given_options(CAPTURE_OPTIONS)):
         raise InputError(f"{given[0]} must be used with --capture.")
     with needs_extra("report"):
         import_module("jinja2")
-    check_may_write(output, inputs=(*inputs, *camera.files))
+    check_outputs(output, [".html"], inputs=(*inputs, *camera.files))
     if volume and volume.suffix.lower() in (".csv", ".toml"):
         raise input_error("VOLUME", ".ome.tif or .zarr (points are given by --points)", volume.suffix, volume)
     microscope, results = light.read_design(design), {}
@@ -73,7 +71,7 @@ def report_command(
     origins = {path.name: read_provenance(path) for path in inputs[1:] if path}
     if volume and (score := origins[volume.name].get(SCORE)):
         results["notes"] = {"volume": f"Of the capture, {score}."}
-    provenance = camera.recorded(provenance_of(*inputs, design=design_text(microscope)))
+    provenance = camera.recorded(provenance_of(*inputs, design=microscope))
     with Progress() as progress, errors_name_file(design):
         write_report(output, microscope, **results, origins=origins, provenance=provenance, progress=progress)
     camera.print_corrections()
@@ -102,7 +100,6 @@ def explore_command(
     Options:
         study: STUDY.toml whose targets are evaluated, as in `gs-jax optimize`.
         output: NEW.toml to save to; a number is added if it exists. [default: NAME-new.toml]
-        terms: FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.
         port: Port of the page; 0 takes a free one.
         browser: Open the page in a browser.
     """
@@ -132,11 +129,7 @@ def explore_command(
 
 @command("demo", "Example: gs-jax demo --out demo")
 def demo_command(*, out: Path = Path("gs-jax-demo")):
-    """Run the whole pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports.
-
-    Options:
-        out: Folder to write to.
-    """
+    """Run the whole pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
     from ..apps.example_pipeline import run
 
     with Progress() as progress:
@@ -147,11 +140,7 @@ def demo_command(*, out: Path = Path("gs-jax-demo")):
 
 @command("benchmark", "Example: gs-jax benchmark --out benchmark")
 def benchmark_command(*, out: Path = Path("gs-jax-benchmark")):
-    """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9).
-
-    Options:
-        out: Folder to write to.
-    """
+    """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
     from ..apps.benchmark_report import write, write_records
     from ..apps.method_benchmark import run
 

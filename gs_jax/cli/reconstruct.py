@@ -4,7 +4,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
@@ -107,9 +107,8 @@ def reconstruct_command(
             in mm.
         score: Also reconstruct four times without a quarter of the lenses, predict their light, and tell how well: a
             score without ground truth.
-        force: Replace existing .toml and .csv files.
     """
-    from ..design.design import design_text, read_design
+    from ..design.design import read_design
     from ..io.point_tables import write_points
     from ..io.provenance import INTENSITY, SCORE, DepthFrame
     from ..io.recordings import open_recording
@@ -143,14 +142,14 @@ def reconstruct_command(
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)
-    text, imager = design_text(microscope), camera.imager(light.imager(microscope))
+    imager = camera.imager(light.imager(microscope))
     frame, from_array = DepthFrame(light.origin(imager)), light.from_array(depths, imager)
     if recording.warm_start and workers.remote:
         raise InputError("--warm-start must be used without --workers and --scheduler, which take frames in any order.")
-    further = {"points": points is not None, "warm_start": bool(recording.warm_start)}
+    further: dict[str, Any] = {"points": points is not None, "warm_start": bool(recording.warm_start)}
     plan = Plan.of(imager, from_array, voxel_um and voxel_um / 1000, **vars(options), **further)
     single = {"--surface": surface, "--score": score}
-    series = SeriesRun(capture, output, points, plan, camera, frame, text, recording, workers, force, single)
+    series = SeriesRun(capture, output, points, plan, camera, frame, microscope, recording, workers, force, single)
     if recording.watch:
         series.check(None)
         with Progress() as progress:
@@ -168,7 +167,7 @@ def reconstruct_command(
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
         predicted = _format_score(plan.score(image, progress)) if score else None
         with progress.step("Writing"):
-            provenance = camera.recorded(provenance_of(capture, options.weights, *camera.files, design=text))
+            provenance = camera.recorded(provenance_of(capture, options.weights, *camera.files, design=microscope))
             provenance |= frame.note if imager.sample is not None else {}
             provenance |= {SCORE: predicted} if predicted else {}
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)

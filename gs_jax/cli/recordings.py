@@ -67,7 +67,7 @@ class SeriesRun:
     plan: Any
     camera: CaptureOptions
     frame: Any
-    design_text: str
+    design: Any
     options: RecordingOptions
     workers: Workers
     force: bool
@@ -150,7 +150,7 @@ class SeriesRun:
         run(series, on_failure=on_failure, progress=progress)
         print_messages()
         seconds, new = time.monotonic() - start, len(series.finished) - before
-        lines = [f"{self.points}: {self._write_points(series)}"] if self.points else []
+        lines = [f"{self.points}: {self._write_points(self.points, series)}"] if self.points else []
         self.camera.print_corrections()
         if check := _print_notes(series):
             lines.insert(0, f"{self.output}: {check}")
@@ -185,7 +185,7 @@ class SeriesRun:
             read, make = _frames_of(Recording(series.names, images, []), self.camera, self.plan, is_live=True)
         partial_outputs[self.output] = RESUMABLE
         state = _State(len(series.finished))
-        table = _Table(partial(self._write_points, series)) if self.points else None
+        table = _Table(partial(self._write_points, self.points, series)) if self.points else None
 
         def changes(timeout: float) -> list[str]:
             if table:
@@ -223,7 +223,7 @@ class SeriesRun:
         from ..io.provenance import input_key
         from ..io.volume_series import VolumeSeries
 
-        provenance = provenance_of(self.plan.weights, *self.camera.files, design=self.design_text)
+        provenance = provenance_of(self.plan.weights, *self.camera.files, design=self.design)
         request = _request_of(provenance, names)
         source = f"{len(names)} frames, {names[0]} to {names[-1]}" if names else "a folder, as captures came"
         provenance = self.camera.recorded(provenance | {input_key(self.capture): plain_text(source)})
@@ -232,7 +232,7 @@ class SeriesRun:
         count, grid = len(names) if names else None, self.frame.grid(self.plan.grid)
         return VolumeSeries(self.output, count, grid, **options, provenance=self.provenance)
 
-    def _write_points(self, series) -> str:
+    def _write_points(self, path: Path, series) -> str:
         """Write the points of all frames; return their number, and that of particles, as text."""
         from ..detection.particles import track
         from ..io.point_tables import write_points_in_time
@@ -249,7 +249,7 @@ class SeriesRun:
         frames = ((number, self.frame.columns(note["points"])) for number, note in series.notes())
         if self.options.track:
             frames = track(frames, self.options.track / 1000)
-        write_points_in_time(self.points, count(frames), provenance=self.provenance | INTENSITY)
+        write_points_in_time(path, count(frames), provenance=self.provenance | INTENSITY)
         text = plural(sum(points), "point")
         return f"{text} of {plural(particles[0], 'particle')}" if self.options.track else text
 

@@ -8,8 +8,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.files import check_output
-from .command import check_may_write, command, given_options, provenance_of
+from .command import check_outputs, command, given_options, provenance_of
 from .options import PSFS, SIMULATED, Counts, DepthLight, DesignPath, Number, Seed, ask_for_unit, objects_in
 
 # Options of the exposure.
@@ -54,12 +53,11 @@ def simulate_command(
     import jax
     import numpy as np
 
-    from ..design.design import design_text, read_design
+    from ..design.design import read_design
     from ..io.captures import CAPTURE_SUFFIXES, write_capture
     from ..simulation.synthetic import Camera, expose, read_scene, simulate
 
-    check_output(output, CAPTURE_SUFFIXES)
-    check_may_write(output, inputs=(scene, design))
+    check_outputs(output, CAPTURE_SUFFIXES, inputs=(scene, design))
     if not noise and output.suffix.lower() == ".png":
         raise InputError(f"{output}: the suffix must be .tif, .tiff or .npy with --no-noise: PNG holds no float32.")
     if scene.suffix.lower() == ".toml":
@@ -79,7 +77,7 @@ def simulate_command(
                 camera = Camera(gain, offset, read_noise, math.inf if full_well is None else full_well, bits)
                 image = np.asarray(expose(image, camera, jax.random.key(seed), peak_electrons=peak_electrons))
         with progress.step("Writing"):
-            write_capture(output, image, provenance_of(scene, design=design_text(microscope)))
+            write_capture(output, image, provenance_of(scene, design=microscope))
     size = " x ".join(map(str, image.shape))
     click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}, {objects_in(imager)}")
 

@@ -15,7 +15,7 @@ from .command import (
     PARTIAL,
     RESUMABLE,
     OptionGroup,
-    check_may_write,
+    check_outputs,
     command,
     given_options,
     partial_outputs,
@@ -49,7 +49,6 @@ class FineTuning(OptionGroup):
         depths: START:STOP:STEP in mm of the volumes, as in `gs-jax reconstruct`.
         voxel_um: Lateral voxel pitch. [default: 4 pixels as seen at the middle depth]
         weights: WEIGHTS.npz to begin with. [default: ours]
-        force: Replace existing .toml and .csv files.
     """
 
     design: DesignPath | None = None
@@ -128,8 +127,7 @@ def train_command(
 
     steps = steps or STEPS[network]
     checkpoint, history = checkpoint_path(output, resume=resume), side_file(output, ".json")
-    check_output(history, [".json"])
-    check_may_write(output, history, inputs=())
+    check_outputs(output, [".npz"], history)
     partial_outputs[checkpoint] = RESUMABLE
     if resume and not checkpoint.exists():
         raise InputError(f"--resume must be used after an interrupted run, got no checkpoint {checkpoint}.")
@@ -174,7 +172,7 @@ def _from_captures(
     import numpy as np
 
     from ..apps.training.from_captures import check_number, fine_tune
-    from ..design.design import design_text, write_design
+    from ..design.design import write_design
     from ..geometry import check_beyond
     from ..io.recordings import capture_files
     from ..reconstruction.networks import read_unrolled, write_unrolled
@@ -194,13 +192,14 @@ def _from_captures(
         raise InputError(
             f"-o must have another name than {design}: the fitted design is written beside WEIGHTS, got {output}."
         )
-    check_may_write(output, history, scaled, inputs=(*files, design, weights, *camera.files), force=tuning.force)
+    inputs = (design, weights, *camera.files)
+    check_outputs(output, [".npz"], history, scaled, inputs=(*files, *inputs), force=tuning.force)
     microscope = light.read_design(design)
     imager = camera.imager(microscope.imager())
     check_beyond(imager, depths, "--depths")
     grid = voxel_grid(imager, depths, tuning.voxel_um and tuning.voxel_um / 1000, pixels=PIXELS_PER_VOXEL)
     start = read_unrolled(weights) if weights else Unrolled.pretrained()
-    record = camera.recorded(provenance_of(folder, design, weights, *camera.files))
+    record = camera.recorded(provenance_of(folder, *inputs))
     with Progress() as progress:
         images = [camera.read(file) for file in files]
         radius = fit_radius(images, imager, grid, start, progress=progress)
@@ -208,7 +207,7 @@ def _from_captures(
         lengths = {key: getattr(microscope.lens, key) for key in ("radius_of_curvature_mm", "focal_length_mm")}
         lengths = {key: np.round(radius.factor * np.array(value), 6) for key, value in lengths.items() if value}
         microscope = microscope.replace(**lengths, provenance={**microscope.provenance, **record})
-        provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
+        provenance = provenance_of(folder, *inputs, design=microscope)
 
         def keep(networks):
             write_design(scaled, microscope)
