@@ -11,10 +11,9 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from ..base.errors import InputError
-from ..design.centers import LENS_KEYS
 from ..design.conversion import medium_in_words
 from ..design.design import Design
-from ..design.tables import CalibrationTable
+from ..design.tables import LENS_KEYS, CalibrationTable
 from ..design.validation import reach
 from ..geometry import Imager
 from ..io.provenance import Provenance

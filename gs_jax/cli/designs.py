@@ -35,7 +35,7 @@ def layout_command(
         seed: Seed of the layout.
         output: CENTERS.csv, with the header x_mm,y_mm.
     """
-    from ..design.centers import write_centers
+    from ..design.tables import write_centers
     from ..layouts import coverage, nearest_neighbour_distances, random_layout
 
     check_outputs(output, [".csv"], force=force)

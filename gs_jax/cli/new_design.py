@@ -244,27 +244,26 @@ def _fill_centers(known: dict[str, Any], file: Path | None, asking: bool) -> Non
 
 def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
     """Read the file's centres, when unit and origin are known."""
-    from ..design.centers import lens_columns, read_centers, unit_of_file
     from ..design.start import check_origin_said, check_unit_said
+    from ..design.tables import CentersFile
 
-    columns, unit, origin = (known.get(f"centers_{key}") for key in ("columns", "unit", "origin"))
-    header_unit = unit_of_file(file, columns)
-    if own := next(iter(lens_columns(file, columns)), None):
+    unit, origin = known.get("centers_unit"), known.get("centers_origin")
+    table = CentersFile(file, known.get("centers_columns"))
+    if own := next(iter(table.lens), None):
         raise InputError(f"{file}: a column {own} must be in the `centers_file` of a design, got it in --centers.")
-    if unit is None and header_unit is None and asking:
+    if unit is None and table.unit is None and asking:
         unit = click.prompt("unit of the file's numbers", "mm", type=_UNITS)
     options = {
-        "columns": columns,
         "unit": unit,
         "size": tuple(known["size_mm"]) if "size_mm" in known else None,
         "shape": tuple(map(float, known["shape"])),
         "pixel_pitch": known["pixel_pitch_um"] / 1000,
     }
-    plain = read_centers(file, origin="center", **options)
+    plain = table.centers(origin="center", **options)
     with errors_name_file(file):
-        if (unit or header_unit) is None:
+        if (unit or table.unit) is None:
             check_unit_said(plain)
-        if origin is None and (unit or header_unit) != "px":
+        if origin is None and (unit or table.unit) != "px":
             try:
                 check_origin_said(plain)
             except InputError:
@@ -272,7 +271,7 @@ def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
                     raise
                 question = "no x or y is below 0: what are they counted from"
                 origin = click.prompt(question, "corner", type=_ORIGINS)
-    known["centers"] = read_centers(file, origin=origin, mirror=known["mirror"], **options)
+    known["centers"] = table.centers(origin=origin, mirror=known["mirror"], **options)
     known["file"] = file
 
 

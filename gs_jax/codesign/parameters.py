@@ -20,8 +20,8 @@ from jaxtyping import Array, ArrayLike, Float, Float64
 from pydantic import ValidationError
 
 from ..base.errors import InputError
-from ..design.centers import LENS_KEYS
 from ..design.design import Design
+from ..design.tables import LENS_KEYS
 from ..geometry import Imager
 from ..io.toml import one_line
 from ..lenses import EACH

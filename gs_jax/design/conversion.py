@@ -4,7 +4,6 @@ Tables of an imager are in the file's units, with the fewest decimals that repro
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from jaxtyping import Float64
 
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
-from ..io.point_tables import read_columns
 from ..layers import Layers, Sample, layers_in_front, object_surface, reduced_distance
 from ..lenses import lenses_by_type
 from ..materials import EmissionBand, index_of
@@ -185,7 +183,6 @@ def _materials(design) -> list[tuple[str, Any]]:
 
 # Wavelengths of an even band, by Gauss and Legendre, and of a spectrum.
 _EVEN, _PARTS = 3, 5
-_MOST = 100_000
 
 
 def emission_band(
@@ -249,21 +246,6 @@ def check_band(imaging: ImagingTable) -> None:
     if not min(wavelengths) <= middle <= max(wavelengths):
         ends = f"{min(wavelengths):g} to {max(wavelengths):g} nm, of the spectrum"
         raise ValueError(f"`imaging.wavelength_nm` must be within {ends}, got {middle:g}")
-
-
-def inline_spectrum(path: Path, data: dict[str, Any]) -> None:
-    """Replace, in the tables of the design file `path`, `imaging.spectrum_file` by `imaging.spectrum_nm`."""
-    imaging = data.get("imaging")
-    if not isinstance(imaging, dict) or "spectrum_file" not in imaging:
-        return
-    name = imaging.pop("spectrum_file")
-    if not isinstance(name, str) or "spectrum_nm" in imaging:
-        raise InputError(f"`imaging.spectrum_file` must be a file's name, without `imaging.spectrum_nm` ({path}).")
-    try:
-        rows = read_columns(path.parent / name, ("wavelength_nm", "light"), most=_MOST)
-    except InputError as error:
-        raise InputError(f"`imaging.spectrum_file`: {error} ({path})") from error
-    imaging["spectrum_nm"] = rows.numbers.tolist()
 
 
 def tables_of(imager: Imager) -> dict[str, Any]:

@@ -20,11 +20,9 @@ from ..layers import Sample
 from ..lenses import MicrolensArray
 from ..materials import index_of
 from ..typing import PathLike
-from .centers import LENS_KEYS, CentersTable, inline_centers
 from .conversion import (
     chosen_sample,
     emission_band,
-    inline_spectrum,
     layers_of,
     path_in_words,
     plate_index,
@@ -32,8 +30,23 @@ from .conversion import (
     sharp_depths,
     tables_of,
 )
-from .tables import ArrayTable, CalibrationTable, ImagingTable, LayersTable, LensTable, SampleTable, SensorTable
+from .tables import (
+    LENS_KEYS,
+    ArrayTable,
+    CalibrationTable,
+    CentersTable,
+    ImagingTable,
+    LayersTable,
+    LensTable,
+    SampleTable,
+    SensorTable,
+    inline_files,
+)
 from .validation import check_whole, doubts, of_each, slips
+
+
+def _table(title: str, **default: Any) -> Any:
+    return Field(title=title, description="a table", **default)
 
 
 class Design(Table):
@@ -51,27 +64,21 @@ class Design(Table):
     """
 
     name: str = Field(title="name in reports", description="a string")
-    sensor: SensorTable = Field(title="the camera", description="a table")
-    lens: LensTable = Field(title="plano-convex microlenses, alike or not", description="a table")
-    array: ArrayTable = Field(title="the plate, and where its lenses are", description="a table")
-    imaging: ImagingTable = Field(title="where the sensor and the object are, and the light", description="a table")
-    layers: LayersTable = Field(
-        default=LayersTable(), title="filters and windows in the light's path", description="a table"
-    )
-    sample: SampleTable | None = Field(
-        default=None, title="the medium that holds the object by default; air without it", description="a table"
-    )
+    sensor: SensorTable = _table("the camera")
+    lens: LensTable = _table("plano-convex microlenses, alike or not")
+    array: ArrayTable = _table("the plate, and where its lenses are")
+    imaging: ImagingTable = _table("where the sensor and the object are, and the light")
+    layers: LayersTable = _table("filters and windows in the light's path", default=LayersTable())
+    sample: SampleTable | None = _table("the medium that holds the object by default; air without it", default=None)
     samples: dict[str, SampleTable] = Field(
         default={},
         title="samples by name, each a table like `[sample]`, for `--sample NAME`; one is needed without `[sample]`",
         description="a table of tables",
     )
-    calibration: CalibrationTable = Field(
-        default=CalibrationTable(),
-        title="the array as found on the sensor; `gs-jax calibrate` writes it",
-        description="a table",
+    calibration: CalibrationTable = _table(
+        "the array as found on the sensor; `gs-jax calibrate` writes it", default=CalibrationTable()
     )
-    provenance: dict[str, Any] = Field(default={}, title="where the file comes from; free-form", description="a table")
+    provenance: dict[str, Any] = _table("where the file comes from; free-form", default={})
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Design":
@@ -298,8 +305,7 @@ def read_design(path: PathLike) -> Design:
     >>> scope = gs.read_design("mine.toml").imager()
     """
     data = read_toml(path)
-    inline_centers(Path(path), data)
-    inline_spectrum(Path(path), data)
+    inline_files(Path(path), data)
     return checked_design(path, data)
 
 

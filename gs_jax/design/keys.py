@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, get_origin
 from pydantic import BaseModel, ValidationError
 
 from ..io.toml import table_of
-from .centers import LENS_KEYS, CentersTable
 from .design import Design, as_toml
+from .tables import LENS_KEYS, CentersTable
 from .validation import USUAL, unit_of
 
 FRAME = (

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..lenses import sag_slope_over_r
-from .centers import LENS_KEYS, other_reading
 from .conversion import check_band, check_path, object_begins, plate_index, reduced_depth, reduced_sensor_distance
+from .tables import LENS_KEYS
 
 MIN_SPACING_MM = 1e-3
 # Radii at which the slope of a lens is checked.
@@ -76,7 +76,20 @@ def _check_plate(design) -> None:
     if outside.any():
         plate = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
         lens = _lens(design, int(np.argmax(outside)))
-        raise ValueError(f"{_CENTERS} must be {plate}, got {lens}{other_reading(centers, half)}")
+        raise ValueError(f"{_CENTERS} must be {plate}, got {lens}{_other_reading(centers, half)}")
+
+
+def _other_reading(centers: np.ndarray, half: np.ndarray) -> str:
+    """Ask, after `; `, in which unit or from which origin centres would be on a plate of half the size `half`."""
+    reach, positive = np.abs(centers).max(axis=0), (centers >= 0).all()
+    if positive and (reach <= 2 * half).all():
+        return '; are they counted from a corner (`centers_origin = "corner"`)?'
+    # Of micrometres some lens is in the outer half of the plate.
+    if (reach / 1000 <= half).all() and (reach / 1000 > half / 2).any():
+        return '; are they micrometres (`centers_unit = "um"`)?'
+    if positive and (reach / 1000 <= 2 * half).all() and (reach / 1000 > half).any():
+        return '; are they micrometres from a corner (`centers_unit = "um"`, `centers_origin = "corner"`)?'
+    return ""
 
 
 def _check_spacing(design) -> None:
