@@ -9,7 +9,7 @@ import pytest
 
 import gs_jax as gs
 from gs_jax import InputError
-from gs_jax.design.datasheets import band_in_words, datasheet
+from gs_jax.design.datasheets import datasheet, format_band
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.optics.pupil import emission_lines
 from gs_jax.projection.point_sources import full_image_of_points
@@ -93,7 +93,7 @@ def test_a_datasheet_says_what_the_band_changes():
     sheet = datasheet(design(bandwidth_nm=60.0), [20.0])
     focus = sheet["band_focus_distance_mm"]
     assert len(focus) == 3 and focus[0] < focus[1] < focus[2]
-    assert "nm, the image moves by" in band_in_words(sheet)
+    assert "nm, the image moves by" in format_band(sheet)
     assert "band_nm" not in datasheet(design(), [20.0])
 
 

@@ -11,9 +11,8 @@ from jax.test_util import check_grads
 from rich.console import Console
 
 from gs_jax import Imager, MicrolensArray, Sensor, objectives
-from gs_jax.design.datasheets import datasheet, summary, tables
+from gs_jax.design.datasheets import datasheet, findings, summary, tables
 from gs_jax.design.design import read_design
-from gs_jax.design.diagnostics import findings
 from gs_jax.design.start import geomscope
 from gs_jax.objectives.conditions import per_type
 from gs_jax.objectives.quantities import third_order_wavefront

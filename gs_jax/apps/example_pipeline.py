@@ -16,9 +16,8 @@ from ..base.errors import needs_extra
 from ..base.progress import Progress
 from ..codesign.search import run_study
 from ..codesign.search_report import as_records, write_outcome
-from ..design.datasheets import datasheet
+from ..design.datasheets import datasheet, findings
 from ..design.design import Design, write_design
-from ..design.diagnostics import findings
 from ..design.start import geomscope
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress

@@ -70,8 +70,7 @@ def metrics_command(
     from rich.console import Console
 
     from ..base.progress import VERBOSE, verbosity
-    from ..design.datasheets import datasheet, overview, summary, tables
-    from ..design.diagnostics import findings
+    from ..design.datasheets import datasheet, findings, overview, summary, tables
     from ..geometry import check_beyond
 
     check_outputs(json, [".json"], inputs=(design,))

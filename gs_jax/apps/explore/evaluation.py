@@ -30,7 +30,7 @@ _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)
 # Pixels along a side of a spot's window.
 SIZE = 49
 _LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm")
-# As in `gs_jax.design.diagnostics`: spots so many times wider than Eq. 5 and so much uncovered plate are reported.
+# As in `gs_jax.design.datasheets`: spots so many times wider than Eq. 5 and so much uncovered plate are reported.
 _FAR, _MAX_UNCOVERED = 2.0, 0.005
 # Columns of the datasheet that are shown, of the type with the narrowest spot at each depth.
 _NUMBERS = (

@@ -10,9 +10,8 @@ from jaxtyping import Array, Num
 
 from ...base.errors import InputError, needs_extra
 from ...base.progress import Progress
-from ...design.datasheets import datasheet
+from ...design.datasheets import datasheet, findings
 from ...design.design import Design, design_text
-from ...design.diagnostics import findings
 from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text

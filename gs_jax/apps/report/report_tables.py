@@ -21,7 +21,7 @@ from ...mold.solids import MoldShape, preview_solid
 from ...pictures import block_maxima, display_range, downsample, png_uri, shade, to_base64, to_uint8
 from ...typing import PathLike
 
-# Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.diagnostics`.
+# Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.datasheets`.
 _FAR = 2.0
 _MIN_STREHL = 0.01
 
