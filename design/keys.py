@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Polygon, Rectangle
 
-from gs_jax.design.keys import FRAME, Key, design_keys
+from gs_jax.design.start import FRAME, Key, design_keys
 
 HERE = Path(__file__).parent
 PAGE, DRAWING = HERE / "KEYS.md", HERE / "geometry.svg"

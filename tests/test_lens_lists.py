@@ -10,7 +10,7 @@ from gs_jax.codesign.search import problem_of
 from gs_jax.codesign.study import read_study
 from gs_jax.design.datasheets import datasheet, findings, summary, tables
 from gs_jax.design.design import read_design, write_design
-from gs_jax.design.keys import commented, schema
+from gs_jax.design.start import commented, schema
 from gs_jax.lenses import lenses_by_type
 
 from .test_centers import with_file

@@ -17,7 +17,7 @@ import gs_jax as gs
 from experiments.calibration_errors import run
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.codesign.study import Study
-from gs_jax.design.keys import design_keys
+from gs_jax.design.start import design_keys
 
 from .helpers import design_and_capture
 

@@ -94,7 +94,7 @@ def at_terminal() -> bool:
 
 def _print_schema(context: click.Context, param: click.Parameter, value: bool) -> None:
     if value:
-        from ..design.keys import schema
+        from ..design.start import schema
 
         click.echo(json.dumps(schema(), indent=2))
         context.exit()
@@ -130,7 +130,7 @@ def new_design_command(
         output: MY.toml, with a comment for each key.
     """
     from ..design.design import checked_design
-    from ..design.keys import commented
+    from ..design.start import commented
     from ..io.files import write_text
 
     check_outputs(output, [".toml"], inputs=(centers,), force=force)
@@ -244,7 +244,7 @@ def _fill_centers(known: dict[str, Any], file: Path | None, asking: bool) -> Non
 
 def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
     """Read the file's centres, when unit and origin are known."""
-    from ..design.start import check_origin_said, check_unit_said
+    from ..design.start import check_centered, check_in_mm
     from ..design.tables import CentersFile
 
     unit, origin = known.get("centers_unit"), known.get("centers_origin")
@@ -262,10 +262,10 @@ def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
     plain = table.centers(origin="center", **options)
     with errors_name_file(file):
         if (unit or table.unit) is None:
-            check_unit_said(plain)
+            check_in_mm(plain)
         if origin is None and (unit or table.unit) != "px":
             try:
-                check_origin_said(plain)
+                check_centered(plain)
             except InputError:
                 if not asking:
                     raise
@@ -309,8 +309,7 @@ def _fill(known: dict[str, Any], path: str, asking: bool) -> None:
 
 def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> Any:
     """Ask until the answer is allowed; confirm values that look like a wrong unit."""
-    from ..design.keys import design_keys, problem
-    from ..design.start import clash
+    from ..design.start import clash, design_keys, problem
     from ..design.validation import USUAL, meant, slip
 
     key = design_keys()[path]
