@@ -8,7 +8,7 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.cli.options import Depths
+from gs_jax.cli.options import parse_depths
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_points
@@ -152,7 +152,7 @@ def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):
 
 @pytest.mark.parametrize(("text", "count"), [("18:18.3:0.1", 4), ("18:18.25:0.1", 3), ("20:20:1", 1)])
 def test_depths_include_the_stop_only_when_it_falls_on_the_step(text, count):
-    assert len(Depths().convert(text, None, None)) == count
+    assert len(parse_depths(text)) == count
 
 
 POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"

@@ -10,7 +10,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import side_file
 from .command import check_outputs, command, provenance_of
-from .options import CaptureOptions, DepthLight, DesignPath, ask_for_unit
+from .options import CaptureOptions, DepthLight, DesignPath, Parsed, ask_for_unit
 
 # Names of quantities, of which the first four are always fitted.
 NAMES = "sensor-distance rotation shift tilt scale depth-offset lenses sample-at sample-index".split()
@@ -18,21 +18,14 @@ NAMES = "sensor-distance rotation shift tilt scale depth-offset lenses sample-at
 _FAR = 1e4
 
 
-class _Names(click.ParamType):
-    """Names of quantities, separated by commas."""
-
-    name = "NAMES"
-
-    def convert(self, value, param, ctx):
-        if isinstance(value, tuple):
-            return value
-        names = tuple(name.strip().replace("_", "-") for name in value.split(","))
-        if wrong := [name for name in names if name not in NAMES]:
-            self.fail(f"must be some of {', '.join(NAMES)}, got {wrong[0]!r}.", param, ctx)
-        return tuple(name.replace("-", "_") for name in names)
+def _names(text: str) -> tuple[str, ...]:
+    names = [name.strip().replace("_", "-") for name in text.split(",")]
+    if wrong := [name for name in names if name not in NAMES]:
+        raise click.BadParameter(f"must be some of {', '.join(NAMES)}, got {wrong[0]!r}.")
+    return tuple(name.replace("-", "_") for name in names)
 
 
-Names = Annotated[tuple[str, ...], _Names()]
+Names = Annotated[tuple[str, ...], Parsed("NAMES", _names)]
 
 
 @command("calibrate", "Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")

@@ -9,7 +9,7 @@ import click
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
 from .command import OptionGroup, check_outputs, command, given_options, print_warning, provenance_of
-from .options import Binning, Depths, Number, Page, PictureOptions, Steps, Um, check_even, depth_range
+from .options import Binning, MaskDepthList, Number, Page, PictureOptions, Steps, Um, check_even, depth_range
 
 _METHODS = ("admm", "fista", "richardson-lucy", "wiener")
 # Options of the methods that take steps.
@@ -37,14 +37,13 @@ def deconvolve_command(
     capture: Path,
     psf: tuple[Path, ...],
     *,
-    # Of any mask, whose objects may be metres away.
-    depths: Annotated[list[float], Depths(usual=1e5)] | None = None,
+    depths: MaskDepthList | None = None,
     voxel_um: Um | None = None,
     method: Annotated[str, click.Choice(_METHODS)] = "admm",
     steps: Steps = 100,
     weights: Weights,
     stop_at_noise: bool = False,
-    psf_page: Annotated[int | str | None, Page()] = None,
+    psf_page: Page | None = None,
     psf_places: Path | None = None,
     binning: Binning = 1,
     output: Path,

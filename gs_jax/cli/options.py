@@ -7,9 +7,9 @@ repeated here.
 import itertools
 import math
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -61,85 +61,72 @@ def _other_unit(numbers: list[float], usual: tuple[float, float], unit: str) -> 
     return other_unit(numbers, usual, unit)
 
 
-class Depths(click.ParamType):
-    """START:STOP:STEP in mm, inclusive of STOP when it falls on the step; or a list, `10,40`; or one depth."""
+def parse_depths(text: str, *, least: float = NEAREST, usual: float = _FARTHEST) -> list[float]:
+    """Depths of `START:STOP:STEP` in mm, inclusive of STOP when it falls on the step; of a list, `10,40`; or one depth.
 
-    name = "start:stop:step|z,z,..."
+    Raises `click.BadParameter` for depths below `least` or not in order, and for those beyond `usual` that look as if
+    they were in another unit.
+    """
 
-    def __init__(self, least: float = NEAREST, usual: float = _FARTHEST):
-        self.least, self.usual = least, usual
+    def check(is_right: bool, allowed: str, remark: str = "") -> None:
+        if not is_right:
+            raise click.BadParameter(f"must {allowed}, got {text!r}{remark}.")
 
-    def convert(self, value, param, ctx):
-        if isinstance(value, list):
-            return value
-        try:
-            if ":" not in value:
-                return self._list(value, [float(depth) for depth in value.split(",")], param, ctx)
-            start, stop, step = map(float, value.split(":"))
-        except ValueError:
-            allowed = "START:STOP:STEP in mm, such as 18:22:0.25, or a list such as 10,40, or one depth"
-            self.fail(f"must be {allowed}, got {value!r}.", param, ctx)
-        if not all(map(math.isfinite, (start, stop, step))) or not self.least <= start <= stop or not step > 0:
-            self.fail(f"must have {self.least:g} <= START <= STOP and STEP > 0, in mm, got {value!r}.", param, ctx)
+    is_range, start, stop, step = ":" in text, 0.0, 0.0, 1.0
+    try:
+        numbers = [float(number) for number in text.split(":" if is_range else ",")]
+        if is_range:
+            start, stop, step = numbers
+    except ValueError:
+        check(False, "be START:STOP:STEP in mm, such as 18:22:0.25, or a list such as 10,40, or one depth")
+        raise
+    if is_range:
+        is_right = all(map(math.isfinite, numbers)) and least <= start <= stop and step > 0
+        check(is_right, f"have {least:g} <= START <= STOP and STEP > 0, in mm")
         # A step that misses STOP by rounding alone falls on it.
         count = (stop - start) / step + 1 + 1e-6
-        if count > _MAX_DEPTHS + 1:
-            self.fail(f"must have at most {_MAX_DEPTHS} depths, got {value!r}, {count:.3g} depths.", param, ctx)
-        self._check_unit([start, stop, step], param, ctx)
-        return [round(start + i * step, 9) for i in range(int(count))]
-
-    def _list(self, value, depths, param, ctx):
-        """Depths of a list, which ascend."""
-        if not all(self.least <= depth < math.inf for depth in depths):
-            self.fail(f"must be depths of {self.least:g} mm or more, got {value!r}.", param, ctx)
-        if any(after <= before for before, after in itertools.pairwise(depths)):
-            self.fail(f"must be depths in ascending order, got {value!r}.", param, ctx)
-        self._check_unit(depths, param, ctx)
-        return depths
-
-    def _check_unit(self, values, param, ctx):
-        """Fail if depths look as if they were given in another unit."""
-        if max(values) > self.usual and (question := _other_unit(values, (0.0, _FARTHEST), "mm")):
-            self.fail(question, param, ctx)
+        check(count <= _MAX_DEPTHS + 1, f"have at most {_MAX_DEPTHS} depths", f", {count:.3g} depths")
+        depths = [round(start + i * step, 9) for i in range(int(count))]
+    else:
+        check(all(least <= depth < math.inf for depth in numbers), f"be depths of {least:g} mm or more")
+        check(all(after > before for before, after in itertools.pairwise(numbers)), "be depths in ascending order")
+        depths = numbers
+    if max(numbers) > usual and (question := _other_unit(numbers, (0.0, _FARTHEST), "mm")):
+        raise click.BadParameter(question)
+    return depths
 
 
-class DesignFile(click.ParamType):
-    """A file, or the name of a design that comes with the package."""
+class Parsed(click.ParamType):
+    """A value that a function makes of its text, which raises `click.BadParameter`."""
 
-    name = "design"
+    def __init__(self, name: str, parse: Callable[[str], Any]):
+        self.name, self.parse = name, parse
 
     def convert(self, value, param, ctx):
-        path = Path(value)
-        if path.parent == Path() and not path.suffix and not path.exists():
-            return next((shipped for shipped in shipped_designs() if shipped.stem == value), path)
-        return path
+        return self.parse(value) if isinstance(value, str) else value
 
 
-class Page(click.ParamType):
-    """A page, from 1, or `mean` of all."""
-
-    name = "n|mean"
-
-    def convert(self, value, param, ctx):
-        if value == "mean" or isinstance(value, int):
-            return value
-        if value.isdecimal() and int(value) > 0:
-            return int(value)
-        self.fail(f"must be a page, 1 or more, or mean, got {value!r}.", param, ctx)
+def find_design(name: str) -> Path:
+    """The path of a design file, or of a design that comes with the package, by its name."""
+    path = Path(name)
+    if path.parent == Path() and not path.suffix and not path.exists():
+        return next((shipped for shipped in shipped_designs() if shipped.stem == name), path)
+    return path
 
 
-class Region(click.ParamType):
-    """ROW,COLUMN,ROWS,COLUMNS: whole numbers of pixels."""
+def _page(text: str) -> int | str:
+    if text == "mean":
+        return text
+    if text.isdecimal() and int(text) > 0:
+        return int(text)
+    raise click.BadParameter(f"must be a page, 1 or more, or mean, got {text!r}.")
 
-    name = "row,column,rows,columns"
 
-    def convert(self, value, param, ctx):
-        if isinstance(value, tuple):
-            return value
-        numbers = value.split(",")
-        if len(numbers) != 4 or not all(number.strip().isdecimal() for number in numbers):
-            self.fail(f"must be ROW,COLUMN,ROWS,COLUMNS in pixels, from 0, got {value!r}.", param, ctx)
-        return tuple(map(int, numbers))
+def _region(text: str) -> tuple[int, ...]:
+    numbers = text.split(",")
+    if len(numbers) != 4 or not all(number.strip().isdecimal() for number in numbers):
+        raise click.BadParameter(f"must be ROW,COLUMN,ROWS,COLUMNS in pixels, from 0, got {text!r}.")
+    return tuple(map(int, numbers))
 
 
 def shipped_designs() -> list[Path]:
@@ -148,9 +135,13 @@ def shipped_designs() -> list[Path]:
     return sorted((inside if inside.is_dir() else Path(__file__).parents[2] / "design").glob("*.toml"))
 
 
-DESIGN = DesignFile()
-DesignPath = Annotated[Path, DESIGN]
-DepthList = Annotated[list[float], Depths()]
+DesignPath = Annotated[Path, Parsed("design", find_design)]
+Page = Annotated[int | str, Parsed("n|mean", _page)]
+_DEPTHS = "start:stop:step|z,z,..."
+DepthList = Annotated[list[float], Parsed(_DEPTHS, parse_depths)]
+# From the sample's surface, where 0 is a depth; and of any mask, whose objects may be metres away.
+SampleDepthList = Annotated[list[float], Parsed(_DEPTHS, partial(parse_depths, least=0.0))]
+MaskDepthList = Annotated[list[float], Parsed(_DEPTHS, partial(parse_depths, usual=1e5))]
 Steps = Annotated[int, click.IntRange(1, 100_000)]
 Seed = Annotated[int, click.IntRange(0, 2**31 - 1)]
 Binning = Annotated[int, click.IntRange(1, 64)]
@@ -187,7 +178,7 @@ class PictureOptions(OptionGroup):
         offset: Counts of a dark pixel, if there is no --dark.
     """
 
-    page: Annotated[int | str | None, Page()] = None
+    page: Page | None = None
     channel: Annotated[str, click.Choice(["red", "green", "blue"])] | None = None
     bayer: Annotated[str, click.Choice(["RGGB", "BGGR", "GRBG", "GBRG"])] | None = None
     dark: Path | None = None
@@ -198,12 +189,14 @@ class PictureOptions(OptionGroup):
     done: dict[str, list[Path]] = field(default_factory=dict, init=False)
     warnings: dict[str, None] = field(default_factory=dict, init=False)
     sensor: Any = field(default=None, init=False)
+    # The whole sensor, without binning.
+    roi, binning = None, 1
 
     @cached_property
     def readout(self):
         from ..io.camera import Readout
 
-        return Readout(None, 1, self.bayer, self.channel)
+        return Readout(self.roi, self.binning, self.bayer, self.channel)
 
     @cached_property
     def correction(self):
@@ -271,14 +264,8 @@ class CaptureOptions(PictureOptions):
         binning: Side of the squares of pixels that the camera combined.
     """
 
-    roi: Annotated[tuple[int, int, int, int], Region()] | None = None
+    roi: Annotated[tuple[int, ...], Parsed("row,column,rows,columns", _region)] | None = None
     binning: Binning = 1
-
-    @cached_property
-    def readout(self):
-        from ..io.camera import Readout
-
-        return Readout(self.roi, self.binning, self.bayer, self.channel)
 
     def imager(self, imager):
         """The microscope with the pixels of its captures."""

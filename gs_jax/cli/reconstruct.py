@@ -18,9 +18,9 @@ from .options import (
     SUPPRESSIONS,
     CaptureOptions,
     DepthLight,
-    Depths,
     DesignPath,
     Number,
+    SampleDepthList,
     Steps,
     Um,
     WorkerOptions,
@@ -65,8 +65,7 @@ def reconstruct_command(
     capture: Path,
     design: DesignPath,
     *,
-    # From the sample's surface, 0 is a depth.
-    depths: Annotated[list[float], Depths(0.0)],
+    depths: SampleDepthList,
     voxel_um: Um | None = None,
     options: MethodOptions,
     output: Path,
@@ -148,8 +147,7 @@ def reconstruct_command(
         raise InputError("--warm-start must be used without --workers and --scheduler, which take frames in any order.")
     further: dict[str, Any] = {"points": points is not None, "warm_start": bool(recording.warm_start)}
     plan = Plan.of(imager, from_array, voxel_um and voxel_um / 1000, **vars(options), **further)
-    single = {"--surface": surface, "--score": score}
-    series = SeriesRun(capture, output, points, plan, camera, frame, microscope, recording, workers, force, single)
+    series = SeriesRun(capture, output, points, plan, camera, frame, microscope, recording, workers, force)
     if recording.watch:
         series.check(None)
         with Progress() as progress:

@@ -18,7 +18,7 @@ import numpy as np
 from ..base.errors import InputError, InputWarning
 from ..base.machine import Workers
 from ..base.progress import Progress
-from .command import RESUMABLE, OptionGroup, partial_outputs, plural, print_warning, provenance_of
+from .command import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
 from .options import CaptureOptions, Number, Um, objects_in, voxels
 
 # Failed frames that are named; others are only counted, and listed in the journal.
@@ -58,7 +58,7 @@ class RecordingOptions(OptionGroup):
 class SeriesRun:
     """A run that makes the volumes of a recording, or of the captures that come into a folder.
 
-    `plan` is a `Plan`, `frame` a `DepthFrame`. `single` are values of the options of single captures, by name.
+    `plan` is a `Plan`, `frame` a `DepthFrame`.
     """
 
     capture: Path
@@ -71,7 +71,6 @@ class SeriesRun:
     options: RecordingOptions
     workers: Workers
     force: bool
-    single: dict[str, Any]
 
     def check(self, recording) -> bool:
         """Return whether there is a recording, or a folder to watch.
@@ -83,15 +82,9 @@ class SeriesRun:
 
         options, is_series = self.options, recording is not None or self.options.watch
         if not is_series:
-            given = {
-                "--resume": options.resume,
-                "--frame-interval": options.frame_interval,
-                "--track": options.track,
-                "--warm-start": options.warm_start,
-                "--workers or --scheduler": self.workers.remote,
-            }
-            if option := next((name for name, value in given.items() if value), None):
-                raise InputError(f"{option} must be used with a recording, got a single capture {self.capture}.")
+            given = given_options(vars(options)) or ["--workers or --scheduler"] * self.workers.remote
+            if given:
+                raise InputError(f"{given[0]} must be used with a recording, got a single capture {self.capture}.")
             return False
         if self.output.suffix.lower() != ".zarr":
             if recording is None:
@@ -107,9 +100,9 @@ class SeriesRun:
             raise InputError(
                 "--workers and --scheduler must not be given with --watch, which makes one volume at a time."
             )
-        if option := next((name for name, value in self.single.items() if value), None):
+        if given := given_options(("surface", "score")):
             got = "--watch" if recording is None else f"{len(recording.names)} frames"
-            raise InputError(f"{option} must be used with a single capture, got {got}.")
+            raise InputError(f"{given[0]} must be used with a single capture, got {got}.")
         if not (options.resume or self.force):
             check_replaceable(self.output)
         if recording and (options.frame_interval or options.track) and (gap := first_gap(recording.names)):

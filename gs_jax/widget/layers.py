@@ -15,7 +15,7 @@ from jaxtyping import Num
 
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress
-from ..cli.options import DESIGN, CaptureOptions, Depths, depth_range
+from ..cli.options import CaptureOptions, depth_range, find_design, parse_depths
 from ..grid import Grid
 from ..io.ngff import display_range
 from ..io.point_tables import POINTS_HEADER, read_points
@@ -72,7 +72,7 @@ def prepare_layers(
     from ..reconstruction.plan import Plan
 
     try:
-        planes = Depths().convert(depths, None, None)
+        planes = parse_depths(depths)
     except click.BadParameter as error:
         raise InputError(f"Depths {error.message}") from error
     imager = read_design(design).imager()
@@ -169,7 +169,7 @@ def sample() -> list[Any]:
     from ..simulation.phantoms import random_points
     from ..simulation.synthetic import Camera, expose, simulate
 
-    imager = read_design(DESIGN.convert("geomscope", None, None)).imager()
+    imager = read_design(find_design("geomscope")).imager()
     light = simulate(random_points(40, (6.0, 6.0), (18.0, 22.0), seed=0), imager, optics="near", psf="geometric")
     image = np.asarray(expose(light, Camera(), jax.random.key(0), peak_electrons=2e4))
     limits = tuple(map(float, np.percentile(image, (1, 99.95))))

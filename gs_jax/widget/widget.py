@@ -27,7 +27,7 @@ from qtpy.QtCore import QTimer
 
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress, Cancelled
-from ..cli.options import DESIGN, METHODS, SUPPRESSIONS, shipped_designs
+from ..cli.options import METHODS, SUPPRESSIONS, find_design, shipped_designs
 from .layers import Newest, Result, newest_captures, prepare_layers
 
 # Milliseconds between updates of the progress bar.
@@ -108,7 +108,7 @@ class Reconstruct(Container):
 
     def _start(self, name: str, capture: Path | np.ndarray) -> None:
         request = {
-            "design": self.design_file.value or DESIGN.convert(self.design.value, None, None),
+            "design": self.design_file.value or find_design(self.design.value),
             "depths": self.depths.value,
             "voxel_um": self.voxel.value,
             "method": self.method.value,
