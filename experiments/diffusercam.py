@@ -29,7 +29,8 @@ from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.projection.measured_psf import ConvolutionOperator
 from gs_jax.solvers.admm import ConvolutionADMM
-from gs_jax.solvers.base import differences, solve, total_variation
+from gs_jax.solvers.admm import total_variation
+from gs_jax.solvers.base import differences, solve
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 

@@ -31,7 +31,7 @@ COMMANDS = {
     "reconstruct": "reconstruct",
     "calibrate": "calibrate",
     "simulate": "simulate",
-    "deconvolve": "deconvolve",
+    "deconvolve": "reconstruct",
     "metrics": "designs",
     "new-design": "new_design",
     "layout": "designs",

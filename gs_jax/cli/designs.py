@@ -221,8 +221,7 @@ def pareto_command(
     from ..base.errors import errors_name_file
     from ..codesign.pareto import as_json, picture, sweep_of, trade_off
     from ..codesign.study import parent_path, read_study
-    from ..codesign.targets import SIGNS
-    from ..codesign.terms import add_terms
+    from ..codesign.terms import SIGNS, add_terms
     from ..design.design import read_design
     from ..io.files import write_figure
     from ..io.provenance import KEY

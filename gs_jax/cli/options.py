@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import click
 
 from ..base.errors import InputError, InputWarning, input_error
-from ..base.machine import Workers
+from ..base.workers import Workers
 from .command import OptionGroup, print_warning
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
@@ -224,7 +224,7 @@ class PictureOptions(OptionGroup):
         Single sharp pixels are kept. A colour capture and grey images of the point may be combined. Returns a list, as
         the planes may differ in size.
         """
-        from ..io.plane_stacks import read_spots
+        from ..io.recordings import read_spots
 
         spots = read_spots(paths, page=page, readout=self.readout, correction=self.correction)
         return [self._note(path, capture) for path, capture in spots]

@@ -16,8 +16,8 @@ import click
 import numpy as np
 
 from ..base.errors import InputError, InputWarning
-from ..base.machine import Workers
 from ..base.progress import Progress
+from ..base.workers import Workers
 from .command import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
 from .options import CaptureOptions, Number, Um, objects_in, voxels
 
@@ -165,7 +165,8 @@ class SeriesRun:
     def watch(self, progress: Progress) -> None:
         """Make a volume of each capture that comes, until an interrupt, and print a summary."""
         from ..io.captures import read_images
-        from ..io.recordings import Recording, WatchedFolder
+        from ..io.recordings import Recording
+        from ..io.watched_folder import WatchedFolder
         from ..reconstruction.recording import reconstruct_live
 
         folder, series = self.capture, self._open_series(None)
@@ -227,7 +228,7 @@ class SeriesRun:
 
     def _write_points(self, path: Path, series) -> str:
         """Write the points of all frames; return their number, and that of particles, as text."""
-        from ..detection.particles import track
+        from ..detection.linking import track
         from ..io.point_tables import write_points_in_time
         from ..io.provenance import INTENSITY
 

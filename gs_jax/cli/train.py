@@ -9,7 +9,6 @@ import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..base.workers import Workers
 from ..io.files import check_output, checkpoint_path, side_file, write_json
 from .command import (
     PARTIAL,
