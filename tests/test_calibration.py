@@ -39,7 +39,7 @@ from gs_jax.calibration.misfits import alternatives
 from gs_jax.calibration.pattern_matching import match_pattern, match_shift
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
 from gs_jax.calibration.spots import Sources, Spots, find_spots
-from gs_jax.cli.calibrate import NAMES
+from gs_jax.cli.calibrate import FIT_NAMES
 from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout
 from gs_jax.io.captures import read_capture
@@ -505,7 +505,7 @@ def test_a_device_that_is_no_bare_array_is_refused_in_a_line(fit):
 
 
 def test_the_command_knows_what_can_be_fitted():
-    assert tuple(name.replace("-", "_") for name in NAMES) == FITTABLE
+    assert tuple(name.replace("-", "_") for name in FIT_NAMES) == FITTABLE
 
 
 @pytest.mark.integration

@@ -7,7 +7,6 @@ from click.testing import CliRunner
 from PIL import Image
 
 from gs_jax.__main__ import commands
-from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.volumes import read_volume
@@ -107,44 +106,6 @@ def test_a_cameras_offset(folder):
     volume, _, result = reconstruct("capture.tif", "--offset", "100")
     assert "capture.tif: offset 100 taken off" in result.stdout
     assert volume.max() < reconstruct("capture.tif")[0].max()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--roi", "10,4,60,80"], ["--roi", "rows 10 to 69 and columns 4 to 83", "96 x 80"]),
-        (["--roi", "10,4,60,60"], ["capture.tif", "96 x 80", "60 x 60", "--roi"]),
-        (["--binning", "2"], ["capture.tif", "96 x 80", "48 x 40", "--binning"]),
-        (["--bayer", "RGGB"], ["--bayer RGGB", "got none", "red, green, blue"]),
-        (["--channel", "red"], ["capture.tif", "greyscale", "--bayer"]),
-        (["--page", "2"], ["capture.tif", "--page 2", "1 pages"]),
-        (["--dark", "missing.tif"], ["missing.tif", "No such file"]),
-        (["--flat", "design.toml"], ["design.toml", "'.toml'"]),
-        (["--bad-pixels", "design.toml"], ["design.toml", "'.toml'"]),
-        (["--dark", "capture.tif", "--offset", "16"], ["--offset", "--dark"]),
-        (["--dark", "v.ome.tif"], ["v.ome.tif", "must be another file than the inputs"]),
-        (["--method", "surface", "--surface", "v.ome.tif"], ["v.ome.tif", "outputs must be different files"]),
-    ],
-)
-def test_wrong_options_are_one_line(folder, options, words):
-    if "v.ome.tif" in options:
-        save("v.ome.tif", LIGHT)
-    before = sorted(path.name for path in folder.iterdir())
-    arguments = ["reconstruct", "capture.tif", "design.toml", "--depths", "20", "-o", "v.ome.tif", *options]
-    result = CliRunner().invoke(commands, arguments)
-    assert isinstance(result.exception, InputError)
-    message = str(result.exception)
-    assert message.isprintable() and len(message) < 400
-    for word in words:
-        assert word in message, f"{word!r} is not in {message!r}"
-    assert sorted(path.name for path in folder.iterdir()) == before
-
-
-@pytest.mark.parametrize("option", [("--roi", "1,2,3"), ("--page", "0"), ("--page", "x"), ("--bayer", "RGBG")])
-def test_what_is_no_option_is_refused(folder, option):
-    arguments = ["reconstruct", "capture.tif", "design.toml", "--depths", "20", "-o", "v.ome.tif", *option]
-    result = CliRunner().invoke(commands, arguments)
-    assert result.exit_code == 2 and option[0] in result.stderr
 
 
 def test_deconvolve_reads_the_same_way(folder):

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
 
-from .test_designs import MISSING, message_of, written
+from .test_designs import LISTS, MISSING, message_of, written
 
 # Of three lenses, mm.
 CENTERS = ((-1.0, -0.5), (0.5, 1.25), (1.0, -1.0))
@@ -127,11 +126,7 @@ def test_mirror_is_x_against_minus_x(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"centers_unit": "inch"}, ["`array.centers_unit`", "'inch'", '"mm", "um" or "px"']),
         ({"centers_unit": "um"}, ["x_mm,y_mm", "unit must be", "got um"]),
-        ({"centers_origin": "left"}, ["`array.centers_origin`", "'left'", '"corner"']),
-        ({"centers_columns": "x"}, ["`array.centers_columns`", "'x'", "as in the header"]),
-        ({"mirror": "yes"}, ["`array.mirror`", "'yes'", "true or false"]),
         ({"centers_units": "um"}, ["`array.centers_units`", "`centers_unit`"]),
     ],
 )
@@ -139,9 +134,16 @@ def test_wrong_keys(tmp_path, keys, words):
     message_of(with_file(tmp_path, FORMS["ours"], **keys), *words)
 
 
-def test_keys_of_a_file_without_one(tmp_path):
-    message_of(written(tmp_path, {"array.centers_unit": "um"}), "`array.centers_unit`", "needs `array.centers_file`")
-    for wrong in (3, [3], [["x", 1.0]], [[]]):
-        changes = {"array.centers_mm": wrong, "array.mirror": True}
-        with pytest.raises(InputError, match="array.centers_mm"):
-            read_design(written(tmp_path, changes))
+COLUMNS = "x_mm;y_mm;radius_of_curvature_mm;conic_constant\n-1;-0.5;2;0\n0,5;1,25;1,9;-0,5\n1;-1;2;0\n"
+
+
+def test_columns_of_each_lens(tmp_path):
+    lists = read_design(written(tmp_path, LISTS, "lists.toml"))
+    (tmp_path / "c.csv").write_text(COLUMNS)
+    keys = {"lens.radius_of_curvature_mm": MISSING, "array.centers_mm": MISSING, "array.centers_file": "c.csv"}
+    assert read_design(written(tmp_path, keys)) == lists
+    both = "only one of `lens.radius_of_curvature_mm`", "`array.centers_file`"
+    message_of(with_file(tmp_path, COLUMNS), *both)
+    message_of(with_file(tmp_path, COLUMNS.replace("1,9", "thick")), "line 3, radius_of_curvature_mm", "thick")
+    twice = COLUMNS.replace("conic_constant", "radius_of_curvature_mm")
+    message_of(with_file(tmp_path, twice), "'radius_of_curvature_mm' must be in the header once")

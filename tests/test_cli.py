@@ -1,4 +1,5 @@
 import re
+import shlex
 import subprocess
 import sys
 
@@ -140,8 +141,6 @@ def test_a_score_is_told_and_kept(folder, monkeypatch, capsys):
     status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options)
     assert status == 0 and "v.tif: it predicts lenses that were left out" in out
     assert read_provenance(folder / "v.tif")[SCORE] in out
-    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options, "--suppress", "clusters")
-    assert status == 2 and "--score must be used with --suppress none" in err
 
 
 def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):
@@ -228,89 +227,110 @@ def test_info(monkeypatch, capsys):
         assert re.search(rf"^{name} +\S", out, re.MULTILINE)
 
 
+# A command line, and the words of its one line of error.
+BASE = "reconstruct capture.tif design.toml"
+FULL = f"{BASE} --depths 18:22:0.5 -o v.tif"
+LAYOUT, SIMULATE = "layout --size-mm 20 20 --pitch-mm 1.2", "simulate missing.csv design.toml -o c.tif"
 WRONG_ARGUMENTS = [
-    (("recontruct",), "recontruct"),
-    (("reconstruct",), "CAPTURE"),
-    (("reconstruct", "capture.tif"), "DESIGN"),
-    (("reconstruct", "capture.tif", "design.toml", "-o", "v.tif"), "--depths"),
-    (RECONSTRUCT, "--output"),
-    ((*RECONSTRUCT, "-o", "v.jpg"), "suffix must be .tif"),
-    ((*RECONSTRUCT, "-o", "nowhere/v.tif"), "nowhere"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0"), "must be 0.01 to 1e+06 um, got '0'"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "-3"), "got '-3'"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "nan"), "got 'nan'"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "fine"), "got 'fine'"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0.1"), "--voxel-um, --depths: the volume must take at most"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--method", "magic"), "'magic' is not"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--colour"), "--colour"),
-    ((*RECONSTRUCT, "-o", "v.tif", "surplus"), "surplus"),
+    ("recontruct", "recontruct"),
+    ("reconstruct", "CAPTURE"),
+    ("reconstruct capture.tif", "DESIGN"),
+    (f"{BASE} -o v.tif", "--depths"),
+    (f"{BASE} --depths 18:22:0.5", "--output"),
+    (f"{FULL} --colour", "--colour"),
+    (f"{FULL} surplus", "surplus"),
+    (f"{FULL} -o v.jpg", "suffix must be .tif"),
+    (f"{FULL} -o nowhere/v.tif", "nowhere"),
+    *((f"{FULL} --voxel-um {text}", f"must be 0.01 to 1e+06 um, got '{text}'") for text in ("0", "nan", "fine")),
+    (f"{FULL} --voxel-um 0.1", "--voxel-um, --depths: the volume must take at most"),
+    (f"{FULL} --method magic", "'magic' is not"),
     *(
-        ((*RECONSTRUCT[:4], depths, "-o", "v.tif"), f"got {depths!r}")
+        (f"{BASE} --depths {depths or repr('')} -o v.tif", f"got {depths!r}")
         for depths in ("", "18:22", "18:22:0", "18:22:-1", "22:18:1", "-5:5:1", "a:b:c", "18:nan:1",
                        "18:inf:1", "18:22:1e-9", "18:22:1:1", "18,22,1")
     ),
-    ((*RECONSTRUCT[:4], "0:5:1", "-o", "v.tif"), "from the array, got 0"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--method", "admm", "--suppress", "unet"), "--method backproject, got admm"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "cluster"), "'cluster' is not one of 'none', 'points', 'clusters'"),
-    (
-        (*RECONSTRUCT, "-o", "v.tif", "--weights", "w.npz"),
-        "--weights must be used with --method unrolled or --suppress unet, got --method backproject",
-    ),
-    (
-        (*RECONSTRUCT, "-o", "v.tif", "--optics", "near", "--suppress", "points"),
-        "--optics must be full with --suppress points, got near",
-    ),
-    ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "missing.npz"), "missing.npz"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "design.toml"), "design.toml: not a whole"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "suffix must be .csv, got '.txt' (p.txt)"),
-    (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
-    (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),
-    (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "CAPTURE comes first"),
-    (("reconstruct", "capture.tif", "capture.tif", *RECONSTRUCT[3:], "-o", "v.tif"), "capture.tif"),
-    (("layout", "--count", "0", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--count"),
-    (("layout", "--count", "2.5", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--count"),
-    (("layout", "--count", "200", "--size-mm", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--size-mm"),
-    (("layout", "--count", "200", "--size-mm", "20", "-1", "--pitch-mm", "1.2", "-o", "c.csv"), "got '-1'"),
-    (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "9", "-o", "c.csv"), "`pitch` must"),
-    (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.txt"), "c.txt"),
-    (("layout", "--count", "9", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "`count` must be"),
-    (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "1", "--seed", "-1", "-o", "c.csv"), "--seed"),
-    (("demo", "--out", "design.toml"), "design.toml"),
-    (("simulate", "points.csv", "-o", "c.tif"), "DESIGN"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.tif"), "missing.csv"),
-    (("simulate", "capture.tif", "design.toml", "-o", "c.tif"), "capture.tif"),
-    (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "got a design: SCENE comes first"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.jpg"), "got '.jpg'; JPEG is lossy"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.png", "--no-noise"), ".tif, .tiff or .npy with --no-noise"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--psf", "round"), "'round' is not"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),
+    (f"{BASE} --depths 0:5:1 -o v.tif", "from the array, got 0"),
+    ("metrics design.toml --depths 20:22", "must be START:STOP:STEP"),
+    ("metrics design.toml --depths 20,abc", "or a list such as 10,40, or one depth, got '20,abc'"),
+    ("metrics design.toml --depths 20,19", "must be depths in ascending order, got '20,19'"),
+    ("metrics design.toml --depths -1,19", "must be depths of 1e-06 mm or more, got '-1,19'"),
+    ("metrics design.toml --json sheet.txt", "sheet.txt"),
+    (f"{FULL} --method admm --suppress unet", "--method backproject, got admm"),
+    (f"{FULL} --suppress cluster", "'cluster' is not one of 'none', 'points', 'clusters'"),
+    (f"{FULL} --weights w.npz", "--method unrolled or --suppress unet, got --method backproject"),
+    (f"{FULL} --optics near --suppress points", "--optics must be full with --suppress points, got near"),
+    (f"{FULL} --suppress unet --weights missing.npz", "missing.npz"),
+    (f"{FULL} --suppress unet --weights design.toml", "design.toml: not a whole"),
+    (f"{FULL} --points p.txt", "suffix must be .csv, got '.txt' (p.txt)"),
+    ("reconstruct missing.tif design.toml --depths 18 -o v.tif", "missing.tif"),
+    ("reconstruct capture.tif missing.toml --depths 18 -o v.tif", "missing.toml"),
+    ("reconstruct design.toml design.toml --depths 18 -o v.tif", "CAPTURE comes first"),
+    ("reconstruct capture.tif capture.tif --depths 18 -o v.tif", "capture.tif"),
+    # Captures.
+    (f"{FULL} --roi 10,4,60,80", "--roi .*rows 10 to 69 and columns 4 to 83.*96 x 80"),
+    (f"{FULL} --roi 10,4,60,60", "capture.tif.*60 x 60.*96 x 80.*--roi"),
+    (f"{FULL} --roi 1,2,3", "must be ROW,COLUMN,ROWS,COLUMNS"),
+    (f"{FULL} --binning 2", "capture.tif.*48 x 40.*96 x 80.*--binning"),
+    (f"{FULL} --bayer RGGB", "--bayer RGGB.*red, green, blue, got none"),
+    (f"{FULL} --bayer RGBG", "--bayer"),
+    (f"{FULL} --channel red", "capture.tif.*greyscale.*--bayer"),
+    (f"{FULL} --page 2", "capture.tif.*--page 2.*1 pages"),
+    *((f"{FULL} --page {text}", f"must be a page, 1 or more, or mean, got '{text}'") for text in ("0", "x")),
+    (f"{FULL} --dark missing.tif", "missing.tif.*No such file"),
+    (f"{FULL} --flat design.toml", "'.toml'.*design.toml"),
+    (f"{FULL} --bad-pixels design.toml", "'.toml'.*design.toml"),
+    (f"{FULL} --dark capture.tif --offset 16", "--offset.*--dark"),
+    (f"{FULL} --method surface --surface v.tif", "v.tif: outputs must be different files"),
+    # Lengths in another unit.
+    (f"{BASE} --depths 12000:15000:250 -o v.tif", "did you mean [12, 15, 0.25] mm ([12000, 15000, 250] um)?"),
+    ("metrics geomscope --depths 18000", "'--depths': did you mean 18 mm (18000 um)?"),
+    ("deconvolve a.tif p.tif --depths 18e6 -o v.tif", "'--depths': did you mean 18 mm"),
+    (f"{FULL} --voxel-um 0.06", "'--voxel-um': did you mean 60 um (0.06 mm)?"),
+    (f"{LAYOUT} --count 20 --size-mm 6000 6000 -o c.csv", "'--size-mm': did you mean 6 mm (6000 um)?"),
+    ("metrics geomscope --sample-index 1.3 --sample-at 9000", "'--sample-at': did you mean 9 mm (9000 um)?"),
+    # Other commands.
+    (f"{LAYOUT} --count 0 -o c.csv", "--count"),
+    (f"{LAYOUT} --count 200 --size-mm 20 -1 -o c.csv", "got '-1'"),
+    (f"{LAYOUT} --count 200 --pitch-mm 9 -o c.csv", "`pitch` must"),
+    (f"{LAYOUT} --count 200 -o c.txt", "c.txt"),
+    (f"{LAYOUT} --count 9 -o c.csv", "`count` must be"),
+    ("demo --out design.toml", "design.toml"),
+    ("simulate points.csv -o c.tif", "DESIGN"),
+    (SIMULATE, "missing.csv"),
+    ("simulate capture.tif design.toml -o c.tif", "capture.tif"),
+    ("simulate design.toml design.toml -o c.tif", "got a design: SCENE comes first"),
+    (f"{SIMULATE} -o c.jpg", "got '.jpg'; JPEG is lossy"),
+    (f"{SIMULATE} -o c.png --no-noise", ".tif, .tiff or .npy with --no-noise"),
+    (f"{SIMULATE} --psf round", "'round' is not"),
+    (f"{SIMULATE} --gain 0", "must be 0.001 to 1e+06 electrons, got '0'"),
     # Options that would do nothing.
     *(
-        ((*RECONSTRUCT, "--method", method, *option, "-o", "v.tif"), f"{option[0]} must be used with list-rl, ")
+        (f"{FULL} --method {method} {option}", f"{option.split()[0]} must be used with list-rl, ")
         for method in ("backproject", "unrolled", "surface")
-        for option in (("--steps", "9"), ("--stop-at-noise",))
+        for option in ("--steps 9", "--stop-at-noise")
     ),
     *(
-        (("simulate", "p.csv", "design.toml", "-o", "c.tif", "--no-noise", option, "1"), f"{option} must be used with")
+        (f"{SIMULATE} --no-noise {option} 1", f"{option} must be used with")
         for option in ("--seed", "--peak-electrons", "--gain", "--offset", "--read-noise", "--full-well", "--bits")
     ),
-    (("heights", "design.toml", "--step-um", "10", "-o", "l.csv"), "--step-um must be used with heights"),
-    (("mold", "design.toml", "--positive", "--draft-deg", "1", "-o", "m.stl"), "--draft-deg must be used without"),
-    (("report", "design.toml", "--dark", "d.tif", "-o", "r.html"), "--dark must be used with --capture"),
-    (("explore", "design.toml", "--terms", "t.py"), "--terms must be used with --study"),
-    (("info", "design.toml", "--designs"), "--designs must be used without a FILE"),
-    (("new-design", "--centers", "c.csv", "--seed", "1", "-o", "n.toml"), "--seed must be used without --centers"),
-    (("train", "--network", "paper", "--workers", "2", "-o", "w.npz"), "--workers must be used with multislice"),
-    (("train", "--wavelength-nm", "600", "-o", "w.npz"), "--wavelength-nm must be used with --from-captures"),
+    (f"{FULL} --score --suppress clusters", "--score must be used with --suppress none"),
+    ("heights design.toml --step-um 10 -o l.csv", "--step-um must be used with heights"),
+    ("mold design.toml --positive --draft-deg 1 -o m.stl", "--draft-deg must be used without"),
+    ("report design.toml --dark d.tif -o r.html", "--dark must be used with --capture"),
+    ("explore design.toml --terms t.py", "--terms must be used with --study"),
+    ("info design.toml --designs", "--designs must be used without a FILE"),
+    ("new-design --centers c.csv --seed 1 -o n.toml", "--seed must be used without --centers"),
+    ("train --network paper --workers 2 -o w.npz", "--workers must be used with multislice"),
+    ("train --wavelength-nm 600 -o w.npz", "--wavelength-nm must be used with --from-captures"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "words"), WRONG_ARGUMENTS)
 def test_wrong_arguments_give_one_line_and_status_2(folder, monkeypatch, capsys, arguments, words):
-    status, out, err = run(monkeypatch, capsys, *arguments)
-    assert status == 2
-    assert out == ""
-    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err
+    status, out, err = run(monkeypatch, capsys, *shlex.split(arguments))
+    assert (status, out) == (2, "") and len(err) < 400
+    assert re.fullmatch(r"gs-jax: [^\n]+\n", err)
+    assert all(part in err for part in words.split(".*")), err
     assert sorted(p.name for p in folder.iterdir()) == ["capture.tif", "design.toml"]
 
 

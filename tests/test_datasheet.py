@@ -22,6 +22,7 @@ from gs_jax.optics.apertures import clear_diameter, pitch, voronoi_cells
 
 from .helpers import scene
 from .test_cli import run
+from .test_designs import written
 
 LISTS = (
     "depth_mm magnification scale lenses_per_point occupancy lateral_resolution_um axial_resolution_um "
@@ -266,20 +267,21 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     assert "- At 20 mm the image forms 2 mm behind the sensor" in out and "the circle of confusion, 18 um" in out
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--json", "sheet.txt"], "sheet.txt"),
-        (["--depths", "20:22"], "must be START:STOP:STEP"),
-        (["--depths", "20,abc"], "or a list such as 10,40, or one depth, got '20,abc'"),
-        (["--depths", "20,19"], "must be depths in ascending order, got '20,19'"),
-        (["--depths", "-1,19"], "must be depths of 1e-06 mm or more, got '-1,19'"),
-        (["--confusion-um", "0"], "must be 0.01 to 1e"),
-    ],
-)
-def test_wrong_options_are_one_line(tmp_path, monkeypatch, capsys, options, words):
-    monkeypatch.chdir(tmp_path)
-    design = Path(__file__).parents[1] / "design" / "geomscope.toml"
-    status, out, err = run(monkeypatch, capsys, "metrics", design.resolve(), *options)
-    assert (status, out, err.count("\n")) == (2, "", 1) and words in err
-    assert not list(tmp_path.iterdir())
+@pytest.mark.integration
+def test_a_datasheet_of_kinds(tmp_path):
+    """Each kind is what a design of it alone is, but for where its neighbours cut it."""
+    design = read_design(written(tmp_path, {"lens.radius_of_curvature_mm": [2.0, 1.9, 2.0]}))
+    sheet = datasheet(design, [18.0, 24.0])
+    first, second = sheet["kinds"]
+    assert (first["lenses"], second["lenses"], first["radius_of_curvature_mm"]) == (2, 1, 2.0)
+    widths = np.array([first["spot_width_um"], second["spot_width_um"]])
+    np.testing.assert_array_equal(sheet["spot_width_um"], widths.min(0))
+    np.testing.assert_array_equal(sheet["sharpest_kind"], widths.argmin(0) + 1)
+    alone = datasheet(read_design(written(tmp_path)), [18.0, 24.0])
+    assert "kinds" not in alone and sheet["lenses_per_point"] == alone["lenses_per_point"]
+    np.testing.assert_allclose(first["spot_width_um"], alone["spot_width_um"], rtol=0.1)
+    assert sheet["coverage"] == pytest.approx(alone["coverage"], rel=0.01)
+    assert "2 types of lenses, f = 4.419 to 4.651 mm" in summary(design, sheet)
+    assert len(tables(sheet)) == len(tables(alone)) + 1
+    said = findings(design, sheet)
+    assert any(sentence.startswith("Lenses of f = 4.419 mm: in focus by Eqs. 7 and 8") for sentence in said)

@@ -1,7 +1,6 @@
 """Layers, samples and materials in design files."""
 
 import dataclasses
-import warnings
 from typing import get_args
 
 import jax
@@ -126,40 +125,6 @@ def test_a_design_with_samples_needs_a_default_or_a_choice(tmp_path):
     assert "samples by name: gel, water and no default" in str(design) and "no default" not in str(dry)
     shape = check_design(design, MoldShape(), chord=4e-4, resolution=0.025)
     assert all(result.level != "error" for result in shape)
-
-
-# Each: what is changed in a file, and what the line says.
-WRONG = [
-    ({"layers.sensor": [{"thickness_mm": 7.0}]}, "`layers.sensor` must be at most `imaging.sensor_distance_mm`, 5.8"),
-    ({"layers.object": [{"thickness_mm": 40.0}]}, "`imaging.working_distance_mm` must be beyond 40 mm"),
-    ({"layers.object": [{"thickness_mm": 2.0, "refractive_index": 0.9}]}, "from 1 to 5, or one of"),
-    ({"layers.object": [{"thickness_mm": 2.0, "refractive_index": "glass"}]}, "`layers.object[0].refractive_index`"),
-    ({"layers.object": [{"thicknes_mm": 2.0}]}, "did you mean `thickness_mm`"),
-    ({"layers.object": [{"thickness_mm": 2.0, "surface_mm": 2.0}]}, "`sample.surface_mm`"),
-    ({"layers.object": {"thickness_mm": 2.0}}, "`layers.object` must be a list of tables"),
-    (
-        {"layers.sensor": [{"thickness_mm": 550.0}]},
-        "layers.sensor[0].thickness_mm = 550: did you mean 0.55 mm (550 um)",
-    ),
-    ({"sample": {"surface_mm": 19.0}}, "`sample.refractive_index` must be"),
-    ({"sample": {"refractive_index": 1.43, "surface_mm": 31.0}}, "must be beyond 31 mm, where layers end"),
-    (STACK | {"sample": {"refractive_index": 1.43, "surface_mm": 1.0}}, "`sample.surface_mm` must be 2 mm or more"),
-    ({"lens.orientation": "curved", "sample": {"refractive_index": 1.33}}, "curved side in front, got a sample in"),
-    ({"lens.orientation": "curved", "samples": {"gel": {"refractive_index": 1.33}}}, "`samples.gel.surface_mm`"),
-    ({"samples": {"air": {"refractive_index": 1.33}}}, "`samples.air` must have another name"),
-    ({"samples": {"none": {"refractive_index": 1.33}}}, "`samples.none` must have another name"),
-    ({"samples": {"gel": 1.33}}, "`samples.gel` must be a table"),
-    ({"lens.refractive_index": "air"}, "`lens.refractive_index` must be above 1"),
-    ({"lens.refractive_index": "PMMA", "imaging.wavelength_nm": 400.0}, "`imaging.wavelength_nm` and `lens.refrac"),
-]
-
-
-@pytest.mark.parametrize(("changes", "words"), WRONG, ids=[words for _, words in WRONG])
-def test_files_that_are_refused(changes, words):
-    with pytest.raises(InputError) as caught, warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        design_of(changes)
-    assert words in str(caught.value) and str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize(

@@ -93,11 +93,12 @@ def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):
         (*RECONSTRUCT, "-o", f"../{folder.name}/capture.tif"),
         (*RECONSTRUCT, "-o", "linked.tif"),
         (*RECONSTRUCT, "-o", "pointer.tif"),
+        (*RECONSTRUCT, "--dark", "dark.tif", "-o", "dark.tif"),
         ("simulate", "scene.ome.tif", "design.toml", "-o", "scene.ome.tif"),
         ("optimize", "design.toml", "--study", "study.toml", "-o", "design.toml"),
         ("optimize", "design.toml", "--study", "study.toml", "-o", "study.toml"),
     ):
-        for name in ("scene.ome.tif", "study.toml"):
+        for name in ("scene.ome.tif", "study.toml", "dark.tif"):
             (folder / name).touch()
         before = {path: path.read_bytes() for path in folder.iterdir()}
         status, _, err = run(monkeypatch, capsys, *arguments)

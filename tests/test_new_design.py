@@ -358,6 +358,7 @@ def test_the_schema_takes_what_is_shipped(folder, monkeypatch, capsys):
     assert refused_by(made, file, made) is None
     file["lens"]["radius_of_curvature_mm"] = [2.0, -1.9]
     assert refused_by(made, file, made) == "range"
+    assert made["$defs"]["LensTable"]["required"] == ["refractive_index"]
 
 
 @pytest.mark.parametrize(

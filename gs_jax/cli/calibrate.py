@@ -13,19 +13,19 @@ from .command import check_outputs, command, provenance_of
 from .options import CaptureOptions, DepthLight, DesignPath, Parsed, ask_for_unit
 
 # Names of quantities, of which the first four are always fitted.
-NAMES = "sensor-distance rotation shift tilt scale depth-offset lenses sample-at sample-index".split()
+FIT_NAMES = "sensor-distance rotation shift tilt scale depth-offset lenses sample-at sample-index".split()
 # Depth of the source of a pattern unless --positions says another, mm: 10 m.
 _FAR = 1e4
 
 
 def _names(text: str) -> tuple[str, ...]:
     names = [name.strip().replace("_", "-") for name in text.split(",")]
-    if wrong := [name for name in names if name not in NAMES]:
-        raise click.BadParameter(f"must be some of {', '.join(NAMES)}, got {wrong[0]!r}.")
+    if wrong := [name for name in names if name not in FIT_NAMES]:
+        raise click.BadParameter(f"must be some of {', '.join(FIT_NAMES)}, got {wrong[0]!r}.")
     return tuple(name.replace("-", "_") for name in names)
 
 
-Names = Annotated[tuple[str, ...], Parsed("NAMES", _names)]
+Names = Annotated[tuple[str, ...], Parsed("FIT_NAMES", _names)]
 
 
 @command("calibrate", "Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")
