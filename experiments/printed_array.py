@@ -27,7 +27,7 @@ from gs_jax import Imager, MicrolensArray, Sensor, calibrate
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
-from gs_jax.calibration.wide_spots import half_light_radii, mean_shift
+from gs_jax.calibration.spots import half_light_radii, mean_shift
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type

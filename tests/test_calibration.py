@@ -37,8 +37,8 @@ from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
 from gs_jax.calibration.initial_guess import guess_without_lenses
 from gs_jax.calibration.misfits import alternatives
 from gs_jax.calibration.pattern_matching import match_pattern, match_shift
+from gs_jax.calibration.sources import Sources, Spots, find_spots
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
-from gs_jax.calibration.spots import Sources, Spots, find_spots
 from gs_jax.cli.calibrate import FIT_NAMES
 from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout

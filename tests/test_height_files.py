@@ -16,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 import gs_jax as gs
 from gs_jax.__main__ import commands
 from gs_jax.io.provenance import read_provenance
-from gs_jax.mold.height_files import HEIGHT_SUFFIXES, write_heights
+from gs_jax.mold.heights import HEIGHT_SUFFIXES, write_heights
 
 CENTERS = ((-1.1, 0.7), (0.9, -0.4), (0.2, 1.4), (1.3, 1.1))
 SIZE = (4.0, 5.0)

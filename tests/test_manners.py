@@ -27,7 +27,7 @@ from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
-from gs_jax.mold.height_files import HEIGHT_SUFFIXES, write_heights
+from gs_jax.mold.heights import HEIGHT_SUFFIXES, write_heights
 from gs_jax.optics.psf import PSFS
 from gs_jax.projection.forward_model import FIDELITIES
 from gs_jax.reconstruction.deconvolution import SOLVERS

@@ -34,6 +34,17 @@ from .jackknife import jackknife_errors
 from .misfits import best_alternative, describe_misfit, would_fit
 from .pattern_matching import MIN_SPOTS
 from .sample import OF_SAMPLE, check_fitted_sample, with_surface
+from .sources import (
+    CaptureFit,
+    MisfitError,
+    Sources,
+    SpotLists,
+    Spots,
+    assign_spots,
+    capture_fits,
+    find_blurred_spots_mm,
+    find_spots_mm,
+)
 from .spot_model import (
     FITTABLE,
     FITTED,
@@ -54,18 +65,7 @@ from .spot_model import (
     trace_core_offsets,
     weighted_residuals,
 )
-from .spots import (
-    CaptureFit,
-    MisfitError,
-    Sources,
-    SpotLists,
-    Spots,
-    assign_spots,
-    capture_fits,
-    find_blurred_spots_mm,
-    find_spots_mm,
-)
-from .wide_spots import NARROW_WINDOW
+from .spots import NARROW_WINDOW
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)

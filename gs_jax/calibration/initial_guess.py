@@ -17,8 +17,8 @@ from ..lenses import EACH
 from ..optics.raytrace import to_numpy
 from ..typing import Image
 from .pattern_matching import BLURRED, Similarity, match_pattern, match_shift, triangulate_lenses
+from .sources import CaptureFit, Sources, SpotLists, assign_spots, capture_fits, classify_lenses
 from .spot_model import match_radius, trace_core_offsets, with_centers
-from .spots import CaptureFit, Sources, SpotLists, assign_spots, capture_fits, classify_lenses
 
 # Relative error of a scale that is fitted.
 _FREE_SCALE = 0.5

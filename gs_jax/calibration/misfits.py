@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from ..base.errors import InputError
-from .spots import CaptureFit, Sources
+from .sources import CaptureFit, Sources
 
 # Most captures of which all pairs are swapped, alternatives that are fitted, and names of one that are said.
 _MOST_SWAPPED, _MOST_FITTED, _MOST_SAID = 10, 3, 2

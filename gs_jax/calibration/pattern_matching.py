@@ -13,8 +13,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from .sources import SpotLists
 from .spot_model import match_radius
-from .spots import SpotLists
 
 # Brightest spots of each source that pairs begin with, and that are matched; sources and neighbours at most.
 _FIRST, _TRIED, _MOST_SOURCES, _NEIGHBOURS = 5, 20, 3, 12

@@ -117,7 +117,7 @@ def heights_command(design: DesignPath, *, output: Path, step_um: SmallUm = 10.0
     """
     from ..design.design import read_design
     from ..io.provenance import sidecar
-    from ..mold.height_files import HEIGHT_SUFFIXES, write_heights
+    from ..mold.heights import HEIGHT_SUFFIXES, write_heights
 
     check_outputs(output, HEIGHT_SUFFIXES, sidecar(output), inputs=(design,), force=force)
     if output.suffix.lower() == ".csv" and given_options(["step_um"]):
