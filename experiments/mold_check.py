@@ -17,12 +17,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from gs_jax import Imager, MicrolensArray
+from gs_jax import Imager
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design
 from gs_jax.design.start import geomscope
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
+from gs_jax.mold.lenslets import Part
 from gs_jax.mold.make import draw_solid
 from gs_jax.mold.measurement import measure_lenslets, summarize
 from gs_jax.mold.solids import (
@@ -34,7 +35,6 @@ from gs_jax.mold.solids import (
     mold_bounds,
     mold_solid,
     mold_volume,
-    plate_thickness,
 )
 
 CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"
@@ -61,26 +61,26 @@ def differing(imager: Imager) -> Imager:
 
 def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     """Make the array and the mold at one chord error, write, read back and measure."""
-    array, shape = imager.array, MoldShape(label=label)
+    part, shape = Part(imager.array), MoldShape(label=label)
     started = time.perf_counter()
-    part = array_solid(array, chord_um / 1000)
+    array = array_solid(part, chord_um / 1000)
     made = time.perf_counter() - started
-    mold = mold_solid(array, part, shape)
+    mold = mold_solid(part, array, shape)
     with tempfile.TemporaryDirectory() as folder:
-        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (part, mold)]
+        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (array, mold)]
     volumes = [mesh.solid().volume() for mesh in meshes]
-    block = float(np.prod(np.diff(mold_bounds(array, shape), axis=0)))
-    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(array, shape))
-    cast = cast_solid(array, part, shape).volume()
-    numbers = summarize(measure_lenslets(meshes[1], array), imager)
+    block = float(np.prod(np.diff(mold_bounds(part, shape), axis=0)))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(part, shape))
+    cast = cast_solid(part, array, shape).volume()
+    numbers = summarize(measure_lenslets(meshes[1], part), imager)
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),
         "seconds": made,
-        "array_volume_error": volumes[0] / array_volume(array) - 1,
-        "mold_volume_error": volumes[1] / mold_volume(array, shape) - 1,
+        "array_volume_error": volumes[0] / array_volume(part) - 1,
+        "mold_volume_error": volumes[1] / mold_volume(part, shape) - 1,
         "block_filled_error": (volumes[1] + volumes[0] + engraved) / block - 1,
-        "cast_is_array_error": cast / part.volume() - 1,
+        "cast_is_array_error": cast / array.volume() - 1,
         **numbers,
     }
 
@@ -92,22 +92,22 @@ def _through_file(solid, path: Path) -> Mesh:
 
 def draw(design: Design, records: list[dict]) -> Figure:
     """Plot the mold, facets of a few lenses, and the errors of the facets."""
-    array = design.imager().array
+    part = Part(design.imager().array)
     figure = Figure(figsize=(15, 4.6), dpi=110, layout="constrained")
     view = figure.add_subplot(1, 3, 1, projection="3d")
     shape = MoldShape(label=design.name)
-    draw_solid(view, mold_solid(array, array_solid(array, 4e-3), shape), from_below=False)
-    view.set_title(f"mold of {len(array.centers)} lenses")
-    _draw_facets(figure.add_subplot(1, 3, 2), array)
+    draw_solid(view, mold_solid(part, array_solid(part, 4e-3), shape), from_below=False)
+    view.set_title(f"mold of {len(part.centers)} lenses")
+    _draw_facets(figure.add_subplot(1, 3, 2), part)
     axes = figure.add_subplot(1, 3, 3)
     _draw_cost(axes, records)
     return figure
 
 
-def _draw_facets(axes, array: MicrolensArray) -> None:
-    mesh = float32_mesh(array_solid(array, 2e-3))
+def _draw_facets(axes, part: Part) -> None:
+    mesh = float32_mesh(array_solid(part, 2e-3))
     x, y, z = mesh.vertices.T
-    height = -plate_thickness(array) - z
+    height = -part.plate_thickness - z
     corners = mesh.vertices[mesh.facets]
     shown = (np.abs(corners[..., :2]).max(axis=(1, 2)) < 2.2) & (corners[..., 2].max(axis=1) < 0)
     image = axes.tripcolor(x, y, mesh.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")

@@ -13,6 +13,7 @@ from gs_jax import InputError, MicrolensArray
 from gs_jax.__main__ import commands
 from gs_jax.io.provenance import read_provenance
 from gs_jax.mold.export import make_mask, write_mask
+from gs_jax.mold.lenslets import Part
 from gs_jax.mold.solids import MoldShape, alignment_marks, mold_bounds
 
 DESIGNS = Path(__file__).parents[1] / "design"
@@ -36,9 +37,11 @@ def test_openings_are_the_lenses_on_the_plate():
     np.testing.assert_allclose(mask.circles, [[-2, 1, 0.8]])
     assert sum(map(area, mask.openings)) == pytest.approx(PAIR + math.pi / 8, rel=1e-3)
     assert max(np.abs(ring).max() for ring in mask.openings) <= 3
-    low, high = mold_bounds(ARRAY, MoldShape())
+    low, high = mold_bounds(Part(ARRAY), MoldShape())
     np.testing.assert_allclose([mask.outline.min(0), mask.outline.max(0)], [low[:2], high[:2]])
-    assert sum(map(area, mask.marks)) == pytest.approx(sum(plan.area() for plan in alignment_marks(ARRAY, MoldShape())))
+    assert sum(map(area, mask.marks)) == pytest.approx(
+        sum(plan.area() for plan in alignment_marks(Part(ARRAY), MoldShape()))
+    )
     assert len(mask.marks) == 3
 
 

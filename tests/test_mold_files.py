@@ -9,12 +9,13 @@ import trimesh
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
+from gs_jax.mold.lenslets import Part
 from gs_jax.mold.make import check_measurement
-from gs_jax.mold.manufacturability import check_solid
-from gs_jax.mold.measurement import measure_lenslets, summarize
+from gs_jax.mold.manufacturability import CheckResult, check_solid
+from gs_jax.mold.measurement import LensletMeasurement, measure_lenslets, summarize
 from gs_jax.mold.solids import MoldShape, array_solid, array_volume, mold_solid
 
-from .test_mold import CHORD, lenses, random_lenses
+from .test_mold import CENTERS, CHORD, CONICS, RADII, lenses, random_lenses, unequal
 
 
 def corners_in_stl(path):
@@ -26,8 +27,17 @@ def corners_in_stl(path):
     return rows["normal"].astype(float), rows["corners"].astype(float)
 
 
-def behind(array):
-    return Imager(array, Sensor((64, 64), 0.0045), 5.8, 3.0)
+def summary_of(lenses: LensletMeasurement, part: Part) -> dict:
+    return summarize(lenses, Imager(part.array, Sensor((64, 64), 0.0045), 5.8, 3.0))
+
+
+def check_of(summary: dict, chord: float, radius=2.0) -> CheckResult:
+    return check_measurement(summary, chord=chord, radius=radius)[0]
+
+
+def measured_as(other: Part, part: Part, chord: float) -> LensletMeasurement:
+    """The lenses of one part as measured against another."""
+    return measure_lenslets(float32_mesh(array_solid(other, chord)), part)
 
 
 def volume_of(corners):
@@ -35,8 +45,8 @@ def volume_of(corners):
 
 
 def test_stl_holds_the_solid(tmp_path):
-    part = array_solid(random_lenses(), CHORD)
-    write_mesh(tmp_path / "a.stl", float32_mesh(part), "small array")
+    solid = array_solid(random_lenses(), CHORD)
+    write_mesh(tmp_path / "a.stl", float32_mesh(solid), "small array")
     assert (tmp_path / "a.stl").read_bytes()[:80].rstrip() == b"gs_jax, unit: mm, small array"
     normal, corners = corners_in_stl(tmp_path / "a.stl")
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -45,18 +55,18 @@ def test_stl_holds_the_solid(tmp_path):
     # Facets 1e-4 mm wide in coordinates that are rounded by 1e-7 mm.
     np.testing.assert_allclose(normal, cross / area[:, None], atol=2e-3)
     # float32 coordinates: random errors, 1e-7 each, over a thousand facets.
-    np.testing.assert_allclose(volume_of(corners), part.volume(), rtol=1e-7)
+    np.testing.assert_allclose(volume_of(corners), solid.volume(), rtol=1e-7)
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".3mf", ".STL"])
 def test_a_file_is_watertight_for_others_and_reads_back(tmp_path, suffix):
-    array, path = random_lenses(), tmp_path / f"a{suffix}"
-    mesh = float32_mesh(array_solid(array, 2e-4))
+    part, path = random_lenses(), tmp_path / f"a{suffix}"
+    mesh = float32_mesh(array_solid(part, 2e-4))
     write_mesh(path, mesh, 'a <b> & "c"')
     other = trimesh.load_mesh(path)
     assert other.is_watertight and other.is_winding_consistent and other.euler_number == 2
     # The bar, at a finer chord error than the default: small lenses have more rim.
-    np.testing.assert_allclose(other.volume, array_volume(array), rtol=1e-4)
+    np.testing.assert_allclose(other.volume, array_volume(part), rtol=1e-4)
     again = read_mesh(path)
     np.testing.assert_array_equal(np.float32(again.vertices), mesh.vertices)
     np.testing.assert_array_equal(np.sort(again.facets, axis=0), np.sort(mesh.facets, axis=0))
@@ -114,32 +124,32 @@ def test_nothing_is_left_of_a_file_that_could_not_be_written(tmp_path):
 
 @pytest.mark.parametrize("shape", [None, MoldShape(shrinkage=0.03, label="x")])
 def test_lenses_are_where_they_should_be(tmp_path, shape):
-    array = random_lenses()
-    part = array_solid(array, 5e-4)
-    solid = part if shape is None else mold_solid(array, part, shape)
+    part = random_lenses()
+    solid = array_solid(part, 5e-4)
+    solid = solid if shape is None else mold_solid(part, solid, shape)
     write_mesh(tmp_path / "a.stl", float32_mesh(solid), "a")
-    found = measure_lenslets(read_mesh(tmp_path / "a.stl"), array, scale=1.0 if shape is None else shape.scale)
+    found = measure_lenslets(read_mesh(tmp_path / "a.stl"), part, scale=1.0 if shape is None else shape.scale)
     # The bars are 1 um and 0.1 %. What is left is float32 and, in the radius, the lift of the vertices: 0.3 um of 2 mm.
-    np.testing.assert_allclose(found.center, np.asarray(array.centers), atol=1e-5)
+    np.testing.assert_allclose(found.center, np.asarray(part.centers), atol=1e-5)
     np.testing.assert_allclose(found.radius, 2.0, rtol=3e-4)
     assert np.nanmax(np.abs(found.offset)) < 2e-4 and found.misfit.max() < 1e-6
 
 
 def test_lenses_that_are_not_where_they_should_be_are_found():
     """A part made of other centres and another radius than it is measured against."""
-    array = random_lenses()
-    moved = np.asarray(array.centers) + np.random.default_rng(2).uniform(-2e-3, 2e-3, (12, 2))
+    part = random_lenses()
+    moved = np.asarray(part.centers) + np.random.default_rng(2).uniform(-2e-3, 2e-3, (12, 2))
     moved = np.clip(moved, (-2.5, -2.0), (2.5, 2.0))
     # The same rims and sag as a sphere of another radius would have are not kept: the plate's plane is where it was.
     other = lenses(moved, (5.0, 4.0), radius=2.001, thickness=1.0)
-    found = measure_lenslets(float32_mesh(array_solid(other, 5e-4)), array)
+    found = measured_as(other, part, 5e-4)
     np.testing.assert_allclose(found.center, moved, atol=1e-4)
     np.testing.assert_allclose(found.radius, 2.001, atol=1e-3)
-    measured = summarize(found, behind(array))
+    measured = summary_of(found, part)
     assert measured["center_deviation_max_um"] == pytest.approx(
-        1000 * np.linalg.norm(moved - np.asarray(array.centers), axis=1).max(), abs=0.1
+        1000 * np.linalg.norm(moved - np.asarray(part.centers), axis=1).max(), abs=0.1
     )
-    assert check_measurement(measured, chord=5e-4, radius=2.0)[0].level == "error"
+    assert check_of(measured, 5e-4).level == "error"
 
 
 def test_facets_cost_light_as_the_square_of_their_depth():
@@ -147,11 +157,10 @@ def test_facets_cost_light_as_the_square_of_their_depth():
     corners = np.array([[1, 0], [-0.5, 3**0.5 / 2], [-0.5, -(3**0.5) / 2]])
     samples = np.random.default_rng(0).dirichlet([1, 1, 1], 200_000) @ corners
     variation = (samples**2).sum(axis=1).std()
-    array = lenses([[0, 0]], (2.4, 2.4))
+    part = lenses([[0, 0]], (2.4, 2.4))
     measured = {}
     for chord in (2e-4, 4e-4):
-        found = measure_lenslets(float32_mesh(array_solid(array, chord)), array)
-        measured[chord] = summarize(found, behind(array))
+        measured[chord] = summary_of(measured_as(part, part, chord), part)
     rms = {chord: numbers["surface_error_rms_um"] / 1000 for chord, numbers in measured.items()}
     # Not all facets are equilateral, or as deep as they may be.
     for chord, found in rms.items():
@@ -172,17 +181,64 @@ def test_a_file_without_lenses_is_refused():
 
 
 def test_a_lens_that_is_not_there_is_said():
-    array = lenses([[-1.0, 0], [1.0, 0]], (5.0, 4.0))
-    one = lenses([[-1.0, 0]], (5.0, 4.0))
-    found = measure_lenslets(float32_mesh(array_solid(one, CHORD)), array)
+    part, one = lenses([[-1.0, 0], [1.0, 0]], (5.0, 4.0)), lenses([[-1.0, 0]], (5.0, 4.0))
+    found = measured_as(one, part, CHORD)
     assert np.isnan(found.radius).tolist() == [False, True]
-    measured = summarize(found, behind(array))
+    measured = summary_of(found, part)
     assert measured["lenses_not_measured"] == [2] and measured["lenses_measured"] == 1
-    assert any(
-        finding.check == "lenses not measured" for finding in check_measurement(measured, chord=CHORD, radius=2.0)
-    )
+    assert "lenses not measured" in {check.check for check in check_measurement(measured, chord=CHORD, radius=2.0)}
 
 
 def test_float32_arrays_are_measured_alike():
-    array = MicrolensArray(np.array([[0.1, 0.2]], np.float32), size=(3.0, 3.0))
-    assert measure_lenslets(float32_mesh(array_solid(array, CHORD)), array).vertices[0] > 50
+    part = Part(MicrolensArray(np.array([[0.1, 0.2]], np.float32), size=(3.0, 3.0)))
+    assert measured_as(part, part, CHORD).vertices[0] > 50
+
+
+@pytest.mark.parametrize("orientation", ["plano", "curved"])
+def test_radius_and_conic_are_read_back(orientation):
+    part = unequal(orientation=orientation)
+    found = measure_lenslets(float32_mesh(mold_solid(part, array_solid(part, 2e-4))), part)
+    np.testing.assert_allclose(found.center, CENTERS * (1, -1 if orientation == "curved" else 1), atol=1e-5)
+    # The lift is a tenth of a micrometre.
+    np.testing.assert_allclose(found.radius, RADII, rtol=3e-4)
+    np.testing.assert_allclose(found.conic, CONICS, atol=2e-3)
+    assert (found.conic_deviation < 1e-3).all()
+    measured = summary_of(found, part)
+    assert measured["lenses_conic_measured"] == 5 and measured["conic_deviation_max"] < 2e-3
+    assert check_of(measured, 2e-4, radius=1.6).level == "ok"
+
+
+def test_another_conic_is_found():
+    part = unequal()
+    # The land is at the deepest rim: the vertices are where they were.
+    found = measured_as(unequal(conic_constant=CONICS + 0.3), part, 2e-4)
+    np.testing.assert_allclose(found.conic, CONICS + 0.3, atol=3e-3)
+    assert check_of(summary_of(found, part), 2e-4, radius=1.6).level == "error"
+
+
+def test_a_small_aperture_does_not_say_its_conic():
+    array = MicrolensArray([[-0.5, 0], [0.5, 0]], 2.0, 1.43, [0.2, 0.9], size=(2.0, 1.0), conic_constant=-1.0)
+    part = Part(array)
+    found = measured_as(part, part, 5e-5)
+    assert np.isnan(found.conic).tolist() == [True, False]
+    np.testing.assert_allclose(found.radius, 2.0, rtol=1e-3)
+    assert "conic constants of 1 within" in check_of(summary_of(found, part), 5e-5).text
+
+
+@pytest.mark.parametrize(
+    ("diameter", "radius", "conic"), [(0.13, 0.13, 0.0), (0.1, 0.2, -0.6), (0.05, 0.05, 0.0), (0.05, 0.2, 0.0)]
+)
+def test_small_lenses_are_made_and_measured_by_default(diameter, radius, conic):
+    """The chord follows the height of the lens, down to 1.6 um: coarser facets left none to measure, or wild conics."""
+    size = (3 * diameter, 4 * diameter)
+    part = Part(
+        MicrolensArray(diameter * CENTERS[:, ::-1], radius, 1.43, diameter, 0.3, size=size, conic_constant=conic)
+    )
+    assert part.default_chord == pytest.approx(0.01 * part.height) and part.default_chord < 4e-4
+    imager = Imager(part.array, Sensor((100, 100), 1e-3), sensor_distance=radius / 0.43, field_radius=1.0)
+    for chord in (part.default_chord, part.max_chord):
+        summary = summarize(measured_as(part, part, chord), imager)
+        lenses_check = check_of(summary, chord, radius)
+        # The coarsest facets may leave too few for some lenses, which then are not measured.
+        assert lenses_check.level == "ok" or not summary["lenses_measured"], lenses_check.text
+        assert summary["lenses_measured"] == len(CENTERS) or chord > part.default_chord

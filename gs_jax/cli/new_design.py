@@ -171,10 +171,11 @@ def new_design_command(
 
 def _faults_of_mold(design) -> list[str]:
     """Faults for which the lenses of a design cannot be molded."""
+    from ..mold.lenslets import Part
     from ..mold.manufacturability import check_design
-    from ..mold.solids import MoldShape, default_chord
+    from ..mold.solids import MoldShape
 
-    chord = default_chord(design.imager().array)
+    chord = Part(design.imager().array).default_chord
     results = check_design(design, MoldShape(), chord=chord, resolution=0.025)
     return [result.text for result in results if result.level == "error"]
 

@@ -28,7 +28,7 @@ from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import KEY, Provenance, write_sidecar
 from ..lenses import MicrolensArray
 from ..typing import PathLike
-from .lenslets import lenslets_of
+from .lenslets import Part
 from .solids import MoldShape, alignment_marks, mold_bounds
 
 # Readers accept a few million facets of 50 bytes.
@@ -179,9 +179,8 @@ def make_mask(array: MicrolensArray, shape: MoldShape = MoldShape()) -> Mask:
     """
     if array.size is None:
         raise InputError("`array.size_mm` must be finite, got an infinite plate.")
-    lenslets, side = lenslets_of(array), np.asarray(array.plate, float)
-    centers = np.stack([each.center for each in lenslets])
-    radii = np.array([each.semi_aperture for each in lenslets])
+    part, side = Part(array), np.array(array.plate)
+    centers, radii = part.centers, np.array([lenslet.semi_aperture for lenslet in part.lenslets])
     alone = np.all(np.abs(centers) + radii[:, None] <= side / 2, axis=1)
     pairs = KDTree(centers).query_pairs(2 * radii.max(), output_type="ndarray")
     touch = np.hypot(*(centers[pairs[:, 0]] - centers[pairs[:, 1]]).T) <= radii[pairs].sum(axis=1)
@@ -191,9 +190,9 @@ def make_mask(array: MicrolensArray, shape: MoldShape = MoldShape()) -> Mask:
     openings = m3.CrossSection.batch_boolean(discs, m3.OpType.Add) ^ plate
     if (plate - openings).area() < 1e-6 * plate.area():
         raise InputError("`lens.aperture_diameter_mm` must leave some of the plate uncovered; lenses cover it.")
-    (left, bottom, _), (right, top, _) = mold_bounds(array, shape)
+    (left, bottom, _), (right, top, _) = mold_bounds(part, shape)
     outline = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
-    marks = [ring for plan in alignment_marks(array, shape) for ring in plan.to_polygons()]
+    marks = [ring for plan in alignment_marks(part, shape) for ring in plan.to_polygons()]
     return Mask(outline, np.column_stack([centers[alone], 2 * radii[alone]]), openings.to_polygons(), marks)
 
 

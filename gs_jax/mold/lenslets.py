@@ -1,4 +1,4 @@
-"""Lenslet surfaces of a molded array, and their tessellation within a chordal tolerance.
+"""The molded part of an array as numbers: its lenslets, their surface, and facets within a chordal tolerance.
 
 All vertices lie in one plane. Heights are measured from the base, the flat plate between the lenslets, which is as far
 below the vertices as the deepest rim. A lenslet with a higher rim stands on a wall with a draft angle. The surface is
@@ -6,7 +6,9 @@ the maximum of lenslets, walls and base: neighbours end where they intersect. Le
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +22,12 @@ from ..lenses import EACH, MicrolensArray, sag, sag_slope_over_r
 DRAFT = math.radians(5)
 # Steeper rims neither print nor peel well, and their facets are not visible from above.
 MAX_SLOPE = math.radians(75)
+# The chordal tolerance of lenses of 40 um height and more, mm.
+_CHORD = 4e-4
 # Rounds that split large facets; one or two are enough.
 _SPLIT_ROUNDS = 20
-_PROFILE_SAMPLES = 1025
+# Radii at which a profile is sampled: to map it, and to estimate its curvature.
+_MAP_SAMPLES, _SAMPLES = 1025, 257
 
 # Dunavant's quadrature of degree 4 on a triangle, exact for the squared distance of a facet from a sphere.
 NODES = np.array(
@@ -50,7 +55,7 @@ class Lenslet:
         """Slope divided by the distance from the axis, 1/mm."""
         return sag_slope_over_r(np.asarray(squared, float), self.radius, self.conic, self.terms)
 
-    @property
+    @cached_property
     def rim_sag(self) -> float:
         """Sag at the edge of the aperture, mm."""
         return float(self.sag(np.array([self.semi_aperture**2]))[0])
@@ -60,48 +65,130 @@ class Lenslet:
         """Largest manufacturable semi-aperture, mm: the slope is positive and at most `MAX_SLOPE` inside it."""
         if self._is_manufacturable(self.semi_aperture):
             return self.semi_aperture
-        radii = np.linspace(0.0, self.semi_aperture, 1025)
-        first = next(i for i, r in enumerate(radii) if not self._is_manufacturable(r))
-        low, high = (radii[first - 1], radii[first]) if first else (0.0, 0.0)
+        low, high = 0.0, self.semi_aperture
         for _ in range(60):
             middle = (low + high) / 2
             low, high = (middle, high) if self._is_manufacturable(middle) else (low, middle)
-        return float(low)
+        return low
+
+    @property
+    def max_slope(self) -> float:
+        """Largest slope inside the aperture."""
+        r = np.linspace(0, self.semi_aperture, _SAMPLES)
+        return float((r * self.sag_slope_over_r(r**2)).max())
 
     def _is_manufacturable(self, semi_aperture) -> bool:
-        squared = np.linspace(0, semi_aperture, 257) ** 2
+        squared = np.linspace(0, semi_aperture, _SAMPLES) ** 2
         if not ((1 + self.conic) * squared < self.radius**2).all():
             return False
         slope_over_r = self.sag_slope_over_r(squared)
         return bool((slope_over_r > 0).all() and (slope_over_r * np.sqrt(squared) <= math.tan(MAX_SLOPE)).all())
 
 
-def lenslets_of(array: MicrolensArray) -> list[Lenslet]:
-    """Lenslets of an array in the frame of the part.
+@dataclass(frozen=True)
+class Part:
+    """The molded part of an array, in its own frame.
 
     Parts have their lenslets toward -z. An array whose plano side faces the object keeps the design's x and y. One
     whose curved side faces the object is rotated about x, so that its y is reversed; a mirrored part would be wrong.
     """
-    radius, diameter, conic = (np.asarray(array.of_lenses(name), float).tolist() for name in EACH)
-    terms = tuple(np.asarray(array.aspheric_terms, float).tolist())
-    return [
-        Lenslet(center, d / 2, r, k, terms)
-        for center, d, r, k in zip(part_centers(array), diameter, radius, conic, strict=True)
-    ]
 
+    array: MicrolensArray
 
-def part_centers(array: MicrolensArray) -> Float[np.ndarray, "lens 2"]:
-    """Vertices `(x, y)` in the frame of the part, mm."""
-    return np.asarray(array.centers, float) * (1.0, 1.0 if array.orientation == "plano" else -1.0)
+    @cached_property
+    def size(self) -> tuple[float, float]:
+        """`(x, y)` of the plate, mm, infinite if the array has none."""
+        return self.array.plate
 
+    @cached_property
+    def centers(self) -> Float[np.ndarray, "lens 2"]:
+        """Vertices `(x, y)` of the lenslets, mm."""
+        return np.asarray(self.array.centers, float) * (1.0, 1.0 if self.array.orientation == "plano" else -1.0)
 
-def lenslet_height(array: MicrolensArray) -> float:
-    """Height of the vertices above the base, mm: the largest rim sag."""
-    return max(lenslet.rim_sag for lenslet in lenslets_of(array))
+    @cached_property
+    def lenslets(self) -> list[Lenslet]:
+        """The lenslets, in the order of the array's lenses."""
+        radius, diameter, conic = (np.asarray(self.array.of_lenses(name), float).tolist() for name in EACH)
+        terms = tuple(np.asarray(self.array.aspheric_terms, float).tolist())
+        return [
+            Lenslet(center, d / 2, r, k, terms)
+            for center, d, r, k in zip(self.centers, diameter, radius, conic, strict=True)
+        ]
+
+    @cached_property
+    def height(self) -> float:
+        """Height of the vertices above the base, mm: the largest rim sag."""
+        return max(lenslet.rim_sag for lenslet in self.lenslets)
+
+    @property
+    def thickness(self) -> float:
+        """Thickness from the plano face to the vertices, mm."""
+        return float(self.array.substrate_thickness)
+
+    @property
+    def plate_thickness(self) -> float:
+        """Thickness of the plate between the lenslets, mm."""
+        return self.thickness - self.height
+
+    @cached_property
+    def lowest(self) -> float:
+        """Height of the lowest lenslet, from its rim to its vertex, mm."""
+        return min(lenslet.rim_sag for lenslet in self.lenslets)
+
+    @property
+    def max_chord(self) -> float:
+        """The coarsest chordal tolerance, mm: a tenth of the lowest lenslet."""
+        return 0.1 * self.lowest
+
+    @property
+    def default_chord(self) -> float:
+        """The chordal tolerance by default, mm: 0.4 um, or a hundredth of the lowest lenslet."""
+        return min(_CHORD, 0.01 * self.lowest)
+
+    def surface(
+        self, x: Float[np.ndarray, " x"], y: Float[np.ndarray, " y"]
+    ) -> tuple[Float[np.ndarray, "y x"], Int[np.ndarray, "y x"]]:
+        """Heights of the surface above the base on a grid, mm, and the lenslet there, as of `surface_height`."""
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        height, owner = surface_height(self.lenslets, points)
+        return height.reshape(len(y), len(x)), owner.reshape(len(y), len(x))
+
+    @cached_property
+    def visible_radii(self) -> list[float]:
+        """Upper bounds of the distances from each vertex at which the lenslet is not hidden by others, mm.
+
+        The plate is cut into tiles. A lenslet is hidden in a tile if its height at the nearest point of the tile is
+        below another lenslet's height at the farthest point.
+        """
+        step = math.sqrt(math.prod(self.size) / (400 * len(self.lenslets)))
+        count = [math.ceil(side / step) for side in self.size]
+        middles = [(np.arange(n) + 0.5) * (side / n) - side / 2 for n, side in zip(count, self.size, strict=True)]
+        tiles = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+        half = math.hypot(*(side / n for n, side in zip(count, self.size, strict=True))) / 2
+        lower_bound = np.zeros(len(tiles))
+        neighbourhoods = list(_near(self.lenslets, tiles, self.height, half))
+        for lenslet, (near, squared) in zip(self.lenslets, neighbourhoods, strict=True):
+            far = np.sqrt(squared) + half
+            near, far = near[far <= lenslet.semi_aperture], far[far <= lenslet.semi_aperture]
+            lower_bound[near] = np.maximum(lower_bound[near], self.height - lenslet.sag(far**2))
+        radii = []
+        for lenslet, (near, squared) in zip(self.lenslets, neighbourhoods, strict=True):
+            distance, edge = np.sqrt(squared), lenslet.semi_aperture
+            visible = self.height - lenslet.sag(np.clip(distance - half, 0, edge) ** 2) >= lower_bound[near]
+            radii.append(min(edge, float((distance + half)[visible].max(initial=half))))
+        return radii
+
+    def facet_count(self, chord: float) -> float:
+        """Estimated number of facets: equilateral ones of `side^2 = 6 chord / kappa`, and 20 % for the edges."""
+        count = 0.0
+        for lenslet, radius in zip(self.lenslets, self.visible_radii, strict=True):
+            curvature = _Profile(lenslet, radius, _SAMPLES).max_curvature
+            count += math.pi * radius**2 / (math.sqrt(3) / 4 * 6 / curvature * chord)
+        return 1.2 * count
 
 
 def surface_height(
-    lenslets: list[Lenslet], points: Float[np.ndarray, "point 2"], margin: float = 0.0
+    lenslets: Sequence[Lenslet], points: Float[np.ndarray, "point 2"], margin: float = 0.0
 ) -> tuple[Float[np.ndarray, " point"], Int[np.ndarray, " point"]]:
     """Height of the surface above the base at points `(x, y)`, mm, and the index of the lenslet there.
 
@@ -118,32 +205,6 @@ def surface_height(
         height[near[higher]] = own[higher]
         owner[near[higher]] = np.where(beyond[higher] > 0, -1, number)
     return height, np.where(height - second > margin, owner, -1) if margin else owner
-
-
-def visible_radii(lenslets: list[Lenslet], size: tuple[float, float]) -> list[float]:
-    """Upper bounds of the distances from each vertex at which the lenslet is not hidden by others, mm.
-
-    The plate is cut into tiles. A lenslet is hidden in a tile if its height at the nearest point of the tile is below
-    another lenslet's height at the farthest point.
-    """
-    top = max(lenslet.rim_sag for lenslet in lenslets)
-    step = math.sqrt(math.prod(size) / (400 * len(lenslets)))
-    count = [math.ceil(side / step) for side in size]
-    middles = [(np.arange(n) + 0.5) * (side / n) - side / 2 for n, side in zip(count, size, strict=True)]
-    tiles = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
-    half = math.hypot(*(side / n for n, side in zip(count, size, strict=True))) / 2
-    lower_bound = np.zeros(len(tiles))
-    neighbourhoods = list(_near(lenslets, tiles, top, half))
-    for lenslet, (near, squared) in zip(lenslets, neighbourhoods, strict=True):
-        far = np.sqrt(squared) + half
-        near, far = near[far <= lenslet.semi_aperture], far[far <= lenslet.semi_aperture]
-        lower_bound[near] = np.maximum(lower_bound[near], top - lenslet.sag(far**2))
-    radii = []
-    for lenslet, (near, squared) in zip(lenslets, neighbourhoods, strict=True):
-        distance, edge = np.sqrt(squared), lenslet.semi_aperture
-        visible = top - lenslet.sag(np.clip(distance - half, 0, edge) ** 2) >= lower_bound[near]
-        radii.append(min(edge, float((distance + half)[visible].max(initial=half))))
-    return radii
 
 
 def _near(lenslets, points, top, margin=0.0):
@@ -170,16 +231,33 @@ class Tessellation(NamedTuple):
     num_edge: int
 
 
-class _Profile(NamedTuple):
-    """A surface of revolution at some radii: arc length, maps to the plane, and curvatures."""
+class _Profile:
+    """The surface of a lenslet at some radii: curvatures, 1/mm, arc length, and maps to the plane."""
 
-    radii: np.ndarray
-    stretch: np.ndarray
-    arc_length: np.ndarray
-    conformal: np.ndarray
-    equal_area: np.ndarray
-    mean_curvature: np.ndarray
-    max_curvature: float
+    def __init__(self, lenslet: Lenslet, radius: float, samples: int = _MAP_SAMPLES):
+        r = self.radii = np.linspace(0, radius, samples)
+        self._slope_over_r = slope_over_r = lenslet.sag_slope_over_r(r**2)
+        stretch = self.stretch = np.sqrt(1 + (r * slope_over_r) ** 2)
+        meridional = np.gradient(r * slope_over_r, r, edge_order=2) / stretch**3
+        sagittal = slope_over_r / stretch
+        self.mean_curvature = (meridional + sagittal) / 2
+        self.max_curvature = float(max(np.abs(meridional).max(), sagittal.max()))
+
+    def _integral(self, values):
+        return cumulative_simpson(values, x=self.radii, initial=0)
+
+    @cached_property
+    def arc_length(self):
+        return self._integral(self.stretch)
+
+    @cached_property
+    def conformal(self):
+        # (stretch - 1) / r, without a division by zero on the axis.
+        return self.radii * np.exp(self._integral(self.radii * self._slope_over_r**2 / (1 + self.stretch)))
+
+    @cached_property
+    def equal_area(self):
+        return np.sqrt(2 * self._integral(self.radii * self.stretch))
 
 
 def tessellate(lenslet: Lenslet, radius: float, chord: float) -> Tessellation:
@@ -193,7 +271,7 @@ def tessellate(lenslet: Lenslet, radius: float, chord: float) -> Tessellation:
 
     Raises `RuntimeError` if the facets do not converge; they do for slopes up to `MAX_SLOPE`.
     """
-    profile = _profile(lenslet, radius)
+    profile = _Profile(lenslet, radius)
     circumradius = math.sqrt(2 * (1 / profile.max_curvature) * chord - chord**2)
     inner, side = _hexagonal_points(profile, circumradius)
     # Bound both the chordal error of the edge in the plane and its spacing on the surface.
@@ -217,34 +295,6 @@ def tessellate(lenslet: Lenslet, radius: float, chord: float) -> Tessellation:
     raise RuntimeError(f"the tessellation of {lenslet} did not converge within {chord} mm")
 
 
-def estimate_facet_count(lenslets: list[Lenslet], radii: list[float], chord: float) -> float:
-    """Estimated number of facets: equilateral ones of `side^2 = 6 chord / kappa`, and 20 % for the edges."""
-    count = 0.0
-    for lenslet, radius in zip(lenslets, radii, strict=True):
-        curvature = _curvatures(lenslet, np.linspace(0, radius, 257))[1]
-        count += math.pi * radius**2 / (math.sqrt(3) / 4 * 6 / curvature * chord)
-    return 1.2 * count
-
-
-def _profile(lenslet, radius) -> _Profile:
-    r = np.linspace(0, radius, _PROFILE_SAMPLES)
-    slope_over_r = lenslet.sag_slope_over_r(r**2)
-    stretch = np.sqrt(1 + (r * slope_over_r) ** 2)
-    integral = lambda values: cumulative_simpson(values, x=r, initial=0)
-    # (stretch - 1) / r, without a division by zero on the axis.
-    conformal = r * np.exp(integral(r * slope_over_r**2 / (1 + stretch)))
-    equal_area = np.sqrt(2 * integral(r * stretch))
-    return _Profile(r, stretch, integral(stretch), conformal, equal_area, *_curvatures(lenslet, r))
-
-
-def _curvatures(lenslet, r):
-    """Mean curvature at increasing radii from 0, and the largest principal curvature, 1/mm."""
-    slope_over_r = lenslet.sag_slope_over_r(r**2)
-    stretch = np.sqrt(1 + (r * slope_over_r) ** 2)
-    meridional, sagittal = np.gradient(r * slope_over_r, r, edge_order=2) / stretch**3, slope_over_r / stretch
-    return (meridional + sagittal) / 2, float(max(np.abs(meridional).max(), sagittal.max()))
-
-
 def _rescale(points, radii, mapped_radii):
     distance = np.hypot(*points.T)
     return points * (np.interp(distance, radii, mapped_radii) / np.maximum(distance, 1e-300))[:, None]
@@ -254,7 +304,7 @@ def _hexagonal_points(profile: _Profile, circumradius):
     """A hexagonal lattice in the equal-area map, as points `(x, y)`, and its spacing."""
     # The map stretches more toward the rim. The spacing fits at 60 % of the way, where neighbours begin to cut
     # lenslets off; facets that are too large farther out are split.
-    limit, fit = profile.equal_area[-1], int(0.6 * _PROFILE_SAMPLES)
+    limit, fit = profile.equal_area[-1], int(0.6 * _MAP_SAMPLES)
     side = 0.98 * math.sqrt(3) * circumradius * profile.radii[fit] / profile.equal_area[fit]
     count = math.ceil(limit / side) + 1
     i, j = np.meshgrid(*[np.arange(-2 * count, 2 * count + 1)] * 2)

@@ -1,7 +1,6 @@
 """From a design to a printable file with a picture and a report: checked before it is written, measured after."""
 
 import math
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,30 +10,19 @@ import numpy as np
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..design.conversion import AIR
-from ..design.design import Design, read_design
+from ..design.design import Design
 from ..io.files import atomic_write, check_output, side_file, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
-from ..lenses import MicrolensArray
 from ..typing import PathLike
 from .export import MESH_SUFFIXES, check_mesh_reader, float32_mesh, read_mesh, write_mesh
-from .lenslets import lenslets_of, part_centers, surface_height
-from .manufacturability import CheckResult, check_design, check_solid, raise_first_error
+from .lenslets import Part
+from .manufacturability import CheckResult, check_design, check_solid, open_design, raise_first_error
 from .measurement import measure_lenslets, summarize
-from .solids import (
-    MoldShape,
-    array_solid,
-    array_volume,
-    default_chord,
-    mold_solid,
-    mold_volume,
-    preview_solid,
-    volume_tolerance,
-)
+from .solids import MoldShape, array_solid, array_volume, mold_solid, mold_volume, preview_solid, volume_tolerance
 
 # Deviations from the design that are accepted, mm, relative, absolute: far below what calibration corrects.
 CENTER_TOLERANCE, RADIUS_TOLERANCE, CONIC_TOLERANCE = 1e-3, 1e-3, 1e-2
@@ -46,8 +34,8 @@ _FRAMES = {
     "curved": "x as the sensor's, y against it, z toward the sensor: turned over about x; "
     "plano face (sensor's side) at z = 0, lenses toward -z",
 }
-# Pixels of the height map in the picture.
-_MAP_PIXELS = 700
+# Pixels of the height map in the picture, and the color of solids.
+_MAP_PIXELS, _COLOR = 700, (0.78, 0.86, 0.95)
 
 
 def make_mold(
@@ -116,37 +104,36 @@ def make_mold(
     path = check_output(path, MESH_SUFFIXES)
     check_mesh_reader(path)
     picture, record, text = (check_output(beside, [beside.suffix]) for beside in side_files(path))
-    source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)
-    design = design if isinstance(design, Design) else read_design(design)
+    design, source = open_design(design)
     imager = design.imager(AIR)
-    array = imager.array
-    chord = default_chord(array) if chord is None else chord
+    part = Part(imager.array)
+    chord = part.default_chord if chord is None else chord
     checks = check_design(design, shape, chord=chord, resolution=resolution, layer=layer)
     raise_first_error(checks, InputError, source)
-    part = array_solid(array, chord, progress=progress)
+    name = "array" if positive else "mold"
+    solid = array_solid(part, chord, progress=progress)
     with progress.step("Building and checking the solid"):
-        solid = part.scale([shape.scale] * 3) if positive else mold_solid(array, part, shape)
-        volume = shape.scale**3 * array_volume(array) if positive else mold_volume(array, shape)
+        solid = solid.scale([shape.scale] * 3) if positive else mold_solid(part, solid, shape)
+        volume = shape.scale**3 * array_volume(part) if positive else mold_volume(part, shape)
         mesh = float32_mesh(solid)
-        name = "array" if positive else "mold"
-        checks += check_solid(mesh, volume, name, volume_tolerance(array, chord))
+        checks += check_solid(mesh, volume, name, volume_tolerance(part, chord))
         raise_first_error(checks, RuntimeError)
     # The temporary file gets its name only if it passes.
     with progress.step("Writing and measuring"), atomic_write(path) as temporary:
         write_mesh(temporary, mesh, f"{design.name} {name}", provenance)
-        lenses = measure_lenslets(read_mesh(temporary), array, scale=shape.scale)
+        lenses = measure_lenslets(read_mesh(temporary), part, scale=shape.scale)
         summary = summarize(lenses, imager)
         if not summary["lenses_measured"]:
             text = f"the chord error must be finer, got {1000 * chord:g} um, which leaves each lens too few facets"
             raise InputError(f"{source}: {text} to be measured (--chord-um).")
-        checks += check_measurement(summary, chord=chord, radius=min(each.radius for each in lenslets_of(array)))
+        checks += check_measurement(summary, chord=chord, radius=min(lenslet.radius for lenslet in part.lenslets))
         raise_first_error(checks, RuntimeError)
     report = {
         "design": design.name,
         "part": name,
         "file": path.name,
         "unit": "mm",
-        "frame": _FRAMES[array.orientation],
+        "frame": _FRAMES[part.array.orientation],
         "size_mm": np.ptp(mesh.vertices.astype(float), axis=0).round(6).tolist(),
         "facets": len(mesh.facets),
         "file_bytes": path.stat().st_size,
@@ -158,13 +145,13 @@ def make_mold(
         "draft_deg": math.degrees(shape.draft),
         "checks": [asdict(check) for check in checks],
         "verification": summary,
-        "lens_center_deviation_um": (1000 * (lenses.center - part_centers(array))).tolist(),
+        "lens_center_deviation_um": (1000 * (lenses.center - part.centers)).tolist(),
         "lens_radius_mm": lenses.radius.tolist(),
         "lens_conic_constant": lenses.conic.tolist(),
         "lens_surface_error_rms_um": (1000 * lenses.surface_rms).tolist(),
     }
     with progress.step("Drawing"):
-        write_figure(picture, draw_preview(array, None if positive else shape, design.name))
+        write_figure(picture, draw_preview(part, None if positive else shape, design.name))
     write_json(record, report | ({KEY: dict(provenance)} if provenance else {}))
     write_text(text, report_text(report), [".txt"])
     return report
@@ -213,15 +200,14 @@ def report_text(report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw_preview(array: MicrolensArray, shape: MoldShape | None, name: str) -> Figure:
+def draw_preview(part: Part, shape: MoldShape | None, name: str) -> Figure:
     """A height map of the lenses, and the mold of a shape, or the array if it is None, in perspective."""
     figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
-    x, y = (np.linspace(-side / 2, side / 2, _MAP_PIXELS) for side in array.plate)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    height = surface_height(lenslets_of(array), points)[0].reshape(_MAP_PIXELS, _MAP_PIXELS)
+    x, y = (np.linspace(-side / 2, side / 2, _MAP_PIXELS) for side in part.size)
+    height, _ = part.surface(x, y)
     shaded = LightSource(azdeg=315, altdeg=50).hillshade(height, dx=x[1] - x[0], dy=y[1] - y[0])
     # In the frame of the part, but with the y of the design.
-    from_sensor = array.orientation == "plano"
+    from_sensor = part.array.orientation == "plano"
     bottom = y[-1] if from_sensor else y[0]
     axes = figure.add_subplot(1, 2, 1)
     image = axes.imshow(1000 * height, cmap="viridis", extent=(x[0], x[-1], bottom, -bottom), vmin=0)
@@ -230,9 +216,9 @@ def draw_preview(array: MicrolensArray, shape: MoldShape | None, name: str) -> F
     axes.set(title=f"{what}, seen from the {'sensor' if from_sensor else 'object'}", xlabel="x, mm", ylabel="y, mm")
     figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
     view = figure.add_subplot(1, 2, 2, projection="3d")
-    draw_solid(view, preview_solid(array, shape), from_below=shape is None)
+    draw_solid(view, preview_solid(part, shape), from_below=shape is None)
     printable = "".join(c for c in name if " " <= c <= "~").replace("$", r"\$")
-    figure.suptitle(f"{printable}: {'array' if shape is None else 'negative mold'}, {len(array.centers)} lenses")
+    figure.suptitle(f"{printable}: {'array' if shape is None else 'negative mold'}, {len(part.centers)} lenses")
     return figure
 
 
@@ -241,15 +227,11 @@ def draw_solid(axes, solid: m3.Manifold, *, from_below: bool) -> None:
     # Matplotlib sorts facets by depth, which needs facets of similar size.
     extent = float(np.ptp(np.reshape(solid.bounding_box(), (2, 3)), axis=0).max())
     mesh = solid.refine_to_length(extent / 30).to_mesh64()
-    corners = mesh.vert_properties[:, :3][mesh.tri_verts.astype(int)]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    vertices = mesh.vert_properties[:, :3]
     # Light from the upper left of the picture; otherwise cavities look like bumps.
-    light = np.array([0.0, -0.94, -0.33] if from_below else [-0.58, 0.0, 0.81])
-    shade = 0.25 + 0.75 * np.clip(normal @ light, 0, 1)
-    color = np.column_stack([shade[:, None] * np.array([[0.78, 0.86, 0.95]]), np.ones(len(shade))])
-    axes.add_collection3d(Poly3DCollection(corners, facecolors=color, edgecolors=color, linewidths=0.3))
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    light = LightSource(azdeg=180, altdeg=-19) if from_below else LightSource(azdeg=270, altdeg=54)
+    axes.plot_trisurf(*vertices.T, triangles=mesh.tri_verts, color=_COLOR, lightsource=light, linewidth=0.3)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel="x, mm", ylabel="y, mm")
     axes.set_zticks([low[2], high[2]], [f"{low[2]:.3g}", f"z = {high[2]:.3g} mm"])
     axes.set_box_aspect(high - low, zoom=1.0)

@@ -4,6 +4,7 @@ Errors stop the export; warnings are for the user to weigh. Lengths in mm.
 """
 
 import math
+import os
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,12 +13,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..design.conversion import AIR
-from ..design.design import Design
+from ..design.design import Design, read_design
 from ..layouts import cell_edges, coverage, max_gap
-from ..lenses import MicrolensArray
+from ..typing import PathLike
 from .export import Mesh
-from .lenslets import MAX_SLOPE, estimate_facet_count, lenslet_height, lenslets_of, surface_height, visible_radii
-from .solids import MAX_FACETS, VOLUME_TOLERANCE, MoldShape, aperture_fault, max_chord, plate_thickness
+from .lenslets import MAX_SLOPE, Part, surface_height
+from .solids import MAX_FACETS, VOLUME_TOLERANCE, MoldShape, aperture_fault
 
 # Thinner sheets of cast silicone tear when they are peeled off; thinner prints warp.
 MIN_THICKNESS_MM = 0.3
@@ -43,6 +44,13 @@ def raise_first_error(results: list[CheckResult], error: type[Exception], prefix
             raise error(f"{prefix or result.check}: {result.text}")
 
 
+def open_design(design: Design | PathLike) -> tuple[Design, str]:
+    """The design, read if it is a file, and what messages call it."""
+    if isinstance(design, Design):
+        return design, f"design {design.name!r}"
+    return read_design(design), os.fspath(design)
+
+
 def check_design(
     design: Design, shape: MoldShape, *, chord: float, resolution: float, layer: float | None = None
 ) -> list[CheckResult]:
@@ -52,20 +60,21 @@ def check_design(
     `layer` the thickness of its layers, if it prints layers, all in mm.
     """
     imager = design.imager(AIR)
-    array = imager.array
+    part = Part(imager.array)
     # Rims that are too steep have no solid to check further.
-    if (slope := _check_slope(array)).level == "error":
+    if (slope := _check_slope(part)).level == "error":
         return [slope]
+    owner = None if part.array.alike else _owner_map(part)
     return [
-        _check_focal_length(array),
-        _check_plate(array),
+        _check_focal_length(part),
+        _check_plate(part),
         _check_walls(shape),
         slope,
-        _check_spacing(array, resolution),
-        _check_ridges(array, resolution),
-        _check_coverage(array),
-        _check_chord(array, chord, resolution),
-        *([] if layer is None else [_check_layers(array, float(imager.wavelength), layer)]),
+        _check_spacing(part, resolution),
+        _check_ridges(part, owner, resolution),
+        _check_coverage(part, owner),
+        _check_chord(part, chord, resolution),
+        *([] if layer is None else [_check_layers(part, float(imager.wavelength), layer)]),
     ]
 
 
@@ -73,7 +82,8 @@ def _warn_if(condition: bool, check: str, text: str, warning: str, otherwise: st
     return CheckResult(check, "warning", text + warning) if condition else CheckResult(check, "ok", text + otherwise)
 
 
-def _check_focal_length(array: MicrolensArray) -> CheckResult:
+def _check_focal_length(part: Part) -> CheckResult:
+    array = part.array
     given = array.thin_lens_focal_length
     f = np.asarray(array.radius_of_curvature, float) / (float(array.refractive_index) - 1)
     low, high = f"{np.min(f):.4g}", f"{np.max(f):.4g}"
@@ -84,8 +94,8 @@ def _check_focal_length(array: MicrolensArray) -> CheckResult:
     return CheckResult("focal length", "error", text)
 
 
-def _check_plate(array: MicrolensArray) -> CheckResult:
-    t, sag, between = float(array.substrate_thickness), lenslet_height(array), plate_thickness(array)
+def _check_plate(part: Part) -> CheckResult:
+    t, sag, between = part.thickness, part.height, part.plate_thickness
     if between <= 0:
         text = f"`array.substrate_thickness_mm` must be more than the lenses' sag, {sag:.4g} mm, got {t:g}."
         return CheckResult("plate", "error", text)
@@ -99,13 +109,12 @@ def _check_walls(shape: MoldShape) -> CheckResult:
     return _warn_if(is_thin, "walls", text, f"; less than {MIN_THICKNESS_MM} mm warps.")
 
 
-def _check_slope(array: MicrolensArray) -> CheckResult:
-    lenslets = lenslets_of(array)
-    if fault := aperture_fault(lenslets):
+def _check_slope(part: Part) -> CheckResult:
+    array, lenslets = part.array, part.lenslets
+    if fault := aperture_fault(part):
         limit = f"lenses may slope by at most {math.degrees(MAX_SLOPE):g} degrees"
         return CheckResult("edge slope", "error", f"`lens.aperture_diameter_mm` {fault}; {limit}.")
-    radii = [np.linspace(0, each.semi_aperture, 257) for each in lenslets]
-    slope = max(float((r * each.sag_slope_over_r(r**2)).max()) for each, r in zip(lenslets, radii, strict=True))
+    slope = max(lenslet.max_slope for lenslet in lenslets)
     degrees, critical = math.degrees(math.atan(slope)), math.degrees(math.asin(1 / float(array.refractive_index)))
     is_sphere = array.alike and lenslets[0].conic == 0 and not lenslets[0].terms
     text = f"the lenses slope by {'asin(D / 2R) =' if is_sphere else 'up to'} {degrees:.3g} degrees"
@@ -113,41 +122,46 @@ def _check_slope(array: MicrolensArray) -> CheckResult:
     return _warn_if(degrees > critical, "edge slope", text, reflected)
 
 
-def _check_spacing(array: MicrolensArray, resolution: float) -> CheckResult:
-    lenslets = lenslets_of(array)
+def _check_spacing(part: Part, resolution: float) -> CheckResult:
+    lenslets = part.lenslets
     if len(lenslets) == 1:
         return CheckResult("smallest feature", "ok", f"a single lens, {2 * lenslets[0].semi_aperture:g} mm wide.")
-    centers = np.stack([each.center for each in lenslets])
-    distance, nearest = map(np.asarray, KDTree(centers).query(centers, k=2))
+    distance, nearest = map(np.asarray, KDTree(part.centers).query(part.centers, k=2))
     first = int(distance[:, 1].argmin())
     pair = [lenslets[first], lenslets[int(nearest[first, 1])]]
     along = np.linspace(0, 1, 1001)[:, None]
     height, _ = surface_height(pair, pair[0].center * (1 - along) + pair[1].center * along)
-    groove, spacing = max(each.rim_sag for each in pair) - float(height.min()), distance[first, 1]
+    groove, spacing = max(lenslet.rim_sag for lenslet in pair) - float(height.min()), distance[first, 1]
     text = f"the closest lenses are {spacing:.4g} mm apart, with a groove {1000 * groove:.4g} um deep between them"
     shallow = f": shallower than the printer's resolution, {1000 * resolution:g} um."
     resolved = f"; the printer resolves {1000 * resolution:g} um."
     return _warn_if(groove < resolution, "smallest feature", text, shallow, resolved)
 
 
-def _check_ridges(array: MicrolensArray, resolution: float) -> CheckResult:
+def _check_ridges(part: Part, owner: np.ndarray | None, resolution: float) -> CheckResult:
     """The share of the plate that a printer rounds: ridges of the mold between lenses, as wide as the resolution."""
-    total = _ridge_length(array)
-    share = total * resolution / math.prod(array.plate)
+    total = _equal_ridge_length(part) if owner is None else _ridge_length(owner, part.size)
+    share = total * resolution / math.prod(part.size)
     text = f"{total:.4g} mm of sharp edges between lenses: rounded over {1000 * resolution:g} um they are "
     return CheckResult("sharp edges", "warning" if share > 0.1 else "ok", f"{text}{100 * share:.2g} % of the plate.")
 
 
-def _ridge_length(array: MicrolensArray) -> float:
-    if not array.alike:
-        # The Cauchy-Crofton formula: lengths from crossings with the lines of a grid.
-        owner = _owner_map(array)
-        steps = np.array(array.plate) / _SAMPLES
-        neighbours = (owner[1:], owner[:-1]), (owner[:, 1:], owner[:, :-1])
-        crossings = [((a != b) & (a >= 0) & (b >= 0)).sum() for a, b in neighbours]
-        return math.pi / 4 * float(crossings @ steps[::-1])
-    centers, radius = np.asarray(array.centers, float), float(array.aperture_diameter) / 2
-    edges, side = cell_edges(centers, array.plate), np.array(array.plate) / 2
+def _owner_map(part: Part) -> np.ndarray:
+    """The index of the visible lens on a grid over the plate, -1 for none."""
+    middles = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    return part.surface(*(middles * side for side in part.size))[1]
+
+
+def _ridge_length(owner: np.ndarray, size: tuple[float, float]) -> float:
+    """By the Cauchy-Crofton formula: lengths from crossings with the lines of a grid."""
+    neighbours = (owner[1:], owner[:-1]), (owner[:, 1:], owner[:, :-1])
+    crossings = [((a != b) & (a >= 0) & (b >= 0)).sum() for a, b in neighbours]
+    return math.pi / 4 * float(crossings @ np.array(size)) / _SAMPLES
+
+
+def _equal_ridge_length(part: Part) -> float:
+    centers, radius = part.centers, part.lenslets[0].semi_aperture
+    edges, side = cell_edges(centers, part.size), np.array(part.size) / 2
     half = np.sqrt(np.maximum(radius**2 - edges.height**2, 0))
     first, last = (np.clip(t, -half, half) for t in (edges.low, edges.high))
     between = (np.abs(centers[edges.lens] + (edges.start + edges.end) / 2) < side * (1 - 1e-6)).all(axis=1)
@@ -155,33 +169,26 @@ def _ridge_length(array: MicrolensArray) -> float:
     return float((last - first)[between].sum()) / 2
 
 
-def _owner_map(array: MicrolensArray) -> np.ndarray:
-    """The index of the visible lens on a grid over the plate, -1 for none."""
-    x, y = (((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * side for side in array.plate)
-    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return surface_height(lenslets_of(array), points)[1].reshape(_SAMPLES, _SAMPLES)
-
-
-def _check_coverage(array: MicrolensArray) -> CheckResult:
-    centers = np.asarray(array.centers, float)
-    if array.alike:
-        share = 1 - coverage(centers, array.plate, diameter=float(array.aperture_diameter))
+def _check_coverage(part: Part, owner: np.ndarray | None) -> CheckResult:
+    if owner is None:
+        share = 1 - coverage(part.centers, part.size, diameter=2 * part.lenslets[0].semi_aperture)
     else:
-        share = float((_owner_map(array) < 0).mean())
-    gap = max_gap(centers, array.plate)
+        share = float((owner < 0).mean())
+    gap = max_gap(part.centers, part.size)
     if share < 1e-6:
         return CheckResult("coverage", "ok", "lenses cover the whole plate.")
-    area = share * math.prod(array.plate)
+    area = share * math.prod(part.size)
     text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is no lens, up to {gap:.3g} mm from the nearest lens"
     return CheckResult("coverage", "warning", f"{text}: light passes there unfocused without a mask (`gs-jax mask`).")
 
 
-def _check_chord(array: MicrolensArray, chord: float, resolution: float) -> CheckResult:
-    lenslets, given = lenslets_of(array), f"got {1000 * chord:g} um"
-    if chord > (limit := max_chord(lenslets)):
-        text = f"the chord error must be at most {1000 * limit:.4g} um, a tenth of the height of a lens, {given}"
-        return CheckResult("facets", "error", f"{text} (--chord-um).")
-    if (count := estimate_facet_count(lenslets, visible_radii(lenslets, array.plate), chord)) > MAX_FACETS:
+def _check_chord(part: Part, chord: float, resolution: float) -> CheckResult:
+    given = f"got {1000 * chord:g} um"
+    if chord > part.max_chord:
+        limit = f"{1000 * part.max_chord:.4g} um, a tenth of the height of a lens"
+        text = f"the chord error must be at most {limit}, {given} (--chord-um)."
+        return CheckResult("facets", "error", text)
+    if (count := part.facet_count(chord)) > MAX_FACETS:
         least = 1000 * chord * count / MAX_FACETS
         text = f"the chord error must be at least {least:.2g} um, {given}, which takes about {count:.2g} facets"
         return CheckResult("facets", "error", f"{text} (--chord-um).")
@@ -190,10 +197,10 @@ def _check_chord(array: MicrolensArray, chord: float, resolution: float) -> Chec
     return _warn_if(chord > resolution / 4, "facets", text, visible)
 
 
-def _check_layers(array: MicrolensArray, wavelength: float, layer: float) -> CheckResult:
+def _check_layers(part: Part, wavelength: float, layer: float) -> CheckResult:
     # The standard deviation of a uniform error of one layer is the layer over root 12.
-    waves = (float(array.refractive_index) - 1) * layer / math.sqrt(12) / wavelength
-    layers = lenslet_height(array) / layer
+    waves = (float(part.array.refractive_index) - 1) * layer / math.sqrt(12) / wavelength
+    layers = part.height / layer
     text = f"a lens is {layers:.3g} layers of {1000 * layer:g} um high; their steps are {waves:.2g} waves RMS"
     finest = 1000 * layer * MAX_WAVES / waves
     return _warn_if(waves > MAX_WAVES, "layers", text, f": smooth them, or print layers of {finest:.2g} um.")

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..geometry import Imager
-from ..lenses import MicrolensArray
 from .export import Mesh
-from .lenslets import NODES, WEIGHTS, Lenslet, lenslets_of, part_centers, surface_height
+from .lenslets import NODES, WEIGHTS, Lenslet, Part, surface_height
 
 # A facet belongs to a lenslet if its corners are this close to the surface, its normal is this well aligned, and the
 # lenslet is higher than others by this margin: near a groove, facets are ambiguous.
@@ -55,30 +54,30 @@ class LensletMeasurement:
     vertices: Int[np.ndarray, " lens"]
 
 
-def measure_lenslets(mesh: Mesh, array: MicrolensArray, *, scale: float = 1.0) -> LensletMeasurement:
+def measure_lenslets(mesh: Mesh, part: Part, *, scale: float = 1.0) -> LensletMeasurement:
     """Measures the lenslets of an array or of its mold.
 
-    The mesh is in the frame of the part and `scale` times as large as the array, the design, which assigns facets to
+    The mesh is in the frame of the part and `scale` times as large as the part, the design, which assigns facets to
     lenslets and gives the aspheric terms.
 
     Raises `ValueError` if the mesh has no facet near any lenslet.
     """
     # Depths below the plane of the vertices.
-    vertices = mesh.vertices.astype(float) / scale + (0, 0, float(array.substrate_thickness))
-    design = [_Fit(lenslet) for lenslet in lenslets_of(array)]
+    vertices = mesh.vertices.astype(float) / scale + (0, 0, part.thickness)
+    design = [_Fit(lenslet) for lenslet in part.lenslets]
     fits, _ = _fit_all(vertices, mesh.facets, design)
     # Assign facets again, in case the lenslets are not where the design has them.
     fits, owner = _fit_all(vertices, mesh.facets, fits)
     facets = _group(owner, len(design))
     errors = [_facet_errors(vertices[mesh.facets[its]], fit) for its, fit in zip(facets, design, strict=True)]
     offset, surface_rms, slope_rms = np.array(errors).T
-    known = np.array([1.0 if fit.determined else np.nan for fit in fits])
-    conic_deviation = np.array([fit.conic_deviation for fit in fits]) * known
-    conic = np.array([fit.conic for fit in fits]) * known
+    rows = [(*fit.lenslet.center, fit.lenslet.radius, fit.misfit, fit.conic, fit.conic_deviation) for fit in fits]
+    determined = np.array([[fit.determined] for fit in fits])
+    x, y, radius, misfit, conic, conic_deviation = np.where(determined, rows, np.nan).T
     return LensletMeasurement(
-        center=np.stack([fit.lenslet.center for fit in fits]) * known[:, None],
-        radius=np.array([fit.lenslet.radius for fit in fits]) * known,
-        misfit=np.array([fit.misfit for fit in fits]) * known,
+        center=np.stack([x, y], axis=1),
+        radius=radius,
+        misfit=misfit,
         conic=np.where(conic_deviation <= _MAX_CONIC_DEVIATION, conic, np.nan),
         conic_deviation=conic_deviation,
         offset=offset,
@@ -147,8 +146,9 @@ def _distance(points, fit: _Fit):
 
 def _fit(fit: _Fit, points) -> _Fit:
     """Fits a surface to points by Gauss-Newton, with outliers removed."""
+    fit = _Fit(fit.lenslet, fit.vertex, vertices=len(points))
     if len(points) < _MIN_VERTICES:
-        return replace(fit, vertices=len(points), determined=False)
+        return fit
     # Where facets of two lenslets intersect in slivers, vertices may be assigned wrongly. Iteratively reweighted
     # least squares minimises absolute distances, which such outliers do not affect.
     for _ in range(8):
@@ -158,22 +158,23 @@ def _fit(fit: _Fit, points) -> _Fit:
     for _ in range(3):
         fit = _gauss_newton(fit, points, 4)
     residual, jacobian = _linearize(fit, points)
+    fit = replace(fit, vertices=len(points))
     if not np.isfinite(jacobian).all():
-        return replace(fit, vertices=len(points), determined=False)
+        return fit
     misfit = float(np.sqrt((residual**2).mean()))
     x, y, _, radius = _deviations(jacobian[:, :4], misfit)
     determined = bool(max(x, y, radius / fit.lenslet.radius) < _MAX_DEVIATION)
-    fit = replace(fit, misfit=misfit, conic=math.nan, vertices=len(points), determined=determined)
+    fit = replace(fit, misfit=misfit, determined=determined)
     few = len(points) < _MIN_CONIC_VERTICES
     if not determined or few or _deviations(jacobian, 0.0)[-1] > _MAX_CONIC_DEVIATION:
-        return replace(fit, conic_deviation=math.nan)
+        return fit
     free = fit
     for _ in range(6):
         free = _gauss_newton(free, points, 5)
     residual, jacobian = _linearize(free, points)
     # With one more unknown a fit that has converged is no worse.
     if not float(np.sqrt((residual**2).mean())) <= misfit + _ROUNDING:
-        return replace(fit, conic_deviation=math.nan)
+        return fit
     scatter = math.sqrt((residual**2).sum() / max(len(points) - 5, 1))
     return replace(fit, conic=free.lenslet.conic, conic_deviation=float(_deviations(jacobian, scatter)[-1]))
 
@@ -227,18 +228,22 @@ def summarize(measured: LensletMeasurement, imager: Imager) -> dict[str, Any]:
 
     A surface error `e` delays light by `(n - 1) e`. The Strehl ratio `exp(-(2 pi sigma / lambda)^2)`, Marechal's
     approximation for sigma below 0.1 waves, is that of the facets alone, without the aberrations of the lens.
-
     """
-    array, wavelength, sensor_distance = imager.array, float(imager.wavelength), float(imager.reduced_sensor_distance)
-    power = float(array.refractive_index) - 1
-    shift = np.linalg.norm(measured.center - part_centers(array), axis=1)
-    radius_error = measured.radius / np.asarray(array.of_lenses("radius_of_curvature"), float) - 1
-    conic_error = measured.conic - np.asarray(array.of_lenses("conic_constant"), float)
+    part, wavelength, sensor_distance = Part(imager.array), float(imager.wavelength), imager.reduced_sensor_distance
+    power = float(part.array.refractive_index) - 1
+    shift = np.linalg.norm(measured.center - part.centers, axis=1)
+    radius_error = measured.radius / [lenslet.radius for lenslet in part.lenslets] - 1
+    conic_error = measured.conic - [lenslet.conic for lenslet in part.lenslets]
     waves = power * measured.surface_rms / wavelength
     strehl = np.exp(-((2 * np.pi * waves) ** 2))
     known = np.isfinite(measured.radius)
-    worst = lambda values: float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else math.nan
-    rms = lambda values: float(np.sqrt(np.nanmean(values**2)))
+
+    def worst(values) -> float:
+        return float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else math.nan
+
+    def rms(values) -> float:
+        return float(np.sqrt(np.nanmean(values**2)))
+
     return {
         "lenses": len(shift),
         "lenses_measured": int(known.sum()),
@@ -252,7 +257,7 @@ def summarize(measured: LensletMeasurement, imager: Imager) -> dict[str, Any]:
         "surface_offset_max_um": 1000 * worst(measured.offset),
         "surface_error_rms_um": 1000 * rms(measured.surface_rms),
         "slope_error_rms_mrad": 1000 * rms(measured.slope_rms),
-        "ray_error_on_sensor_rms_um": 1000 * power * sensor_distance * rms(measured.slope_rms),
+        "ray_error_on_sensor_rms_um": 1000 * power * float(sensor_distance) * rms(measured.slope_rms),
         "wavefront_error_rms_waves": rms(waves),
         "strehl_of_facets_median": float(np.nanmedian(strehl)),
         "strehl_of_facets_worst": float(np.nanmin(strehl)),

@@ -20,22 +20,10 @@ from matplotlib.textpath import TextPath
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..layouts import ROUNDING, cell_edges, half_size, in_mm, nearest_neighbour_distances
-from ..lenses import MicrolensArray
-from .lenslets import (
-    DRAFT,
-    Lenslet,
-    estimate_facet_count,
-    lenslet_height,
-    lenslets_of,
-    surface_height,
-    tessellate,
-    visible_radii,
-)
+from .lenslets import DRAFT, Lenslet, Part, tessellate
 
 ENGRAVING_DEPTH = 0.4
 MIN_LENS_DISTANCE = 1e-3
-# The chordal tolerance of lenses of 40 um height and more, mm.
-_CHORD = 4e-4
 # More facets take gigabytes of memory and of disk.
 MAX_FACETS = 5_000_000
 # Relative; facets within 0.5 um of the lenses reach 1e-5.
@@ -97,12 +85,7 @@ class MoldShape:
         return 1 / (1 - self.shrinkage)
 
 
-def plate_thickness(array: MicrolensArray) -> float:
-    """Thickness of the array between its lenses, mm."""
-    return float(array.substrate_thickness) - lenslet_height(array)
-
-
-def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progress | None = None) -> m3.Manifold:
+def array_solid(part: Part, chord: float = 5e-4, *, progress: Progress | None = None) -> m3.Manifold:
     """The array as a solid: the union of a plate with straight sides and one body per lens.
 
     `chord` is the chordal tolerance, the largest distance between a facet and the lens surface, mm.
@@ -111,43 +94,34 @@ def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progres
     rims are too steep, the plate is too thin, or `chord` is not positive, too coarse, or so fine that it takes more
     than `MAX_FACETS`.
     """
-    check_array(array)
-    lenslets, thickness = lenslets_of(array), plate_thickness(array)
-    coarsest, radii = max_chord(lenslets), visible_radii(lenslets, array.plate)
-    if not 0 < chord <= coarsest:
-        raise ValueError(f"`chord` must be positive and at most {coarsest:.4g} mm, got {chord}.")
-    if (count := estimate_facet_count(lenslets, radii, chord)) > MAX_FACETS:
+    check_part(part)
+    if not 0 < chord <= part.max_chord:
+        raise ValueError(f"`chord` must be positive and at most {part.max_chord:.4g} mm, got {chord}.")
+    if (count := part.facet_count(chord)) > MAX_FACETS:
         raise ValueError(f"`chord` of {chord} mm takes about {count:.2g} facets, more than {MAX_FACETS:.2g}.")
-    height, (x, y) = lenslet_height(array), array.plate
-    pairs = list(zip(lenslets, radii, strict=True))
+    bottom, (x, y) = -part.plate_thickness, part.size
+    pairs = list(zip(part.lenslets, part.visible_radii, strict=True))
     bodies = [
-        _lenslet_body(lenslet, radius, chord, height, thickness / 2)
+        _lenslet_body(lenslet, radius, chord, part.height, -bottom / 2)
         for lenslet, radius in (progress or Progress()).track(pairs, "Tessellating")
     ]
-    box = lambda low, high: m3.Manifold.cube([x, y, high - low]).translate([-x / 2, -y / 2, low])
-    lenses = m3.Manifold.batch_boolean(bodies, m3.OpType.Add) ^ box(-thickness, height + _OVERCUT)
+    plate, column = (_box([-x / 2, -y / 2, bottom], [x / 2, y / 2, top]) for top in (0, part.height + _OVERCUT))
+    lenses = m3.Manifold.batch_boolean(bodies, m3.OpType.Add) ^ column
     # Built with lenses up; mirroring also reverses the facets of a solid.
-    return _require_valid((lenses + box(-thickness, 0)).mirror([0, 0, 1]).translate([0, 0, -thickness]))
+    return _require_valid((lenses + plate).mirror([0, 0, 1]).translate([0, 0, bottom]))
 
 
-def max_chord(lenslets: list[Lenslet]) -> float:
-    """The coarsest chordal tolerance, a tenth of the lowest lens, mm."""
-    return 0.1 * min(lenslet.rim_sag for lenslet in lenslets)
-
-
-def default_chord(array: MicrolensArray) -> float:
-    """The chordal tolerance of a part by default, mm: 0.4 um, or a hundredth of the lowest lens."""
-    return min(_CHORD, 0.01 * min(lenslet.rim_sag for lenslet in lenslets_of(array)))
-
-
-def preview_solid(array: MicrolensArray, shape: MoldShape | None) -> m3.Manifold:
+def preview_solid(part: Part, shape: MoldShape | None) -> m3.Manifold:
     """The mold, or the array if `shape` is None, with few facets, to draw it."""
-    lenslets = lenslets_of(array)
     # Equilateral facets of a sphere are `side^2 / (6 R)` deep.
-    smallest = min(lenslet.radius for lenslet in lenslets)
-    chord = math.prod(array.plate) / (_PREVIEW_FACETS * 1.5 * math.sqrt(3) * smallest)
-    part = array_solid(array, min(chord, max_chord(lenslets)))
-    return part if shape is None else mold_solid(array, part, shape)
+    smallest = min(lenslet.radius for lenslet in part.lenslets)
+    chord = math.prod(part.size) / (_PREVIEW_FACETS * 1.5 * math.sqrt(3) * smallest)
+    solid = array_solid(part, min(chord, part.max_chord))
+    return solid if shape is None else mold_solid(part, solid, shape)
+
+
+def _box(low, high) -> m3.Manifold:
+    return m3.Manifold.cube(np.subtract(high, low).tolist()).translate([*low])
 
 
 def _lenslet_body(lenslet: Lenslet, radius, chord, top, depth) -> m3.Manifold:
@@ -167,30 +141,30 @@ def _lenslet_body(lenslet: Lenslet, radius, chord, top, depth) -> m3.Manifold:
     return _require_valid(m3.Manifold(mesh)).translate([*lenslet.center.tolist(), 0.0])
 
 
-def check_array(array: MicrolensArray) -> None:
+def check_part(part: Part) -> None:
     """Raises `ValueError` for an array that has no solid, and `InputError` for lenses outside the plate."""
-    centers, half = np.asarray(array.centers, float), half_size(array.plate)
-    if not np.isfinite(centers).all():
+    half = half_size(part.size)
+    if not np.isfinite(part.centers).all():
         raise ValueError("`centers` must be finite.")
-    if outside := int((np.abs(centers) > half * (1 + ROUNDING)).any(axis=1).sum()):
+    if outside := int((np.abs(part.centers) > half * (1 + ROUNDING)).any(axis=1).sum()):
         raise InputError(f"`centers` must be points on a plate of {in_mm(half)}, got {outside} outside.")
-    if fault := aperture_fault(lenslets_of(array)):
+    if fault := aperture_fault(part):
         raise ValueError(f"`aperture_diameter` {fault}.")
-    if not plate_thickness(array) > 0:
-        allowed = f"more than the lenses' sag, {lenslet_height(array):.4g} mm"
-        raise ValueError(f"`substrate_thickness` must be {allowed}, got {float(array.substrate_thickness):g} mm.")
+    if not part.plate_thickness > 0:
+        allowed = f"more than the lenses' sag, {part.height:.4g} mm"
+        raise ValueError(f"`substrate_thickness` must be {allowed}, got {part.thickness:g} mm.")
     # Arrays in float32 may be slightly closer than the limit.
-    if len(centers) > 1 and (closest := nearest_neighbour_distances(centers).min()) < 0.99 * MIN_LENS_DISTANCE:
+    if (closest := nearest_neighbour_distances(part.centers).min()) < 0.99 * MIN_LENS_DISTANCE:
         raise ValueError(f"`centers` must be {MIN_LENS_DISTANCE} mm apart or more, got {closest:.3g} mm.")
 
 
-def aperture_fault(lenslets: list[Lenslet]) -> str:
+def aperture_fault(part: Part) -> str:
     """Says which aperture is too wide to be manufactured; empty if none is."""
-    for number, lenslet in enumerate(lenslets, 1):
+    for number, lenslet in enumerate(part.lenslets, 1):
         if not 0 < lenslet.semi_aperture or lenslet.max_semi_aperture < lenslet.semi_aperture:
-            which = f" for lens {number}" if len({each.semi_aperture for each in lenslets}) > 1 else ""
-            widest, found = 2 * lenslet.max_semi_aperture, 2 * lenslet.semi_aperture
-            return f"must be positive and at most {widest:.4g} mm{which}, got {found:g}"
+            which = f" for lens {number}" if len({other.semi_aperture for other in part.lenslets}) > 1 else ""
+            limit = f"{2 * lenslet.max_semi_aperture:.4g} mm{which}, got {2 * lenslet.semi_aperture:g}"
+            return f"must be positive and at most {limit}"
     return ""
 
 
@@ -200,46 +174,40 @@ def _require_valid(solid: m3.Manifold) -> m3.Manifold:
     return solid
 
 
-def cast_solid(array: MicrolensArray, part: m3.Manifold, shape: MoldShape) -> m3.Manifold:
-    """What fills the mold up to its rim, before it shrinks."""
-    cavity = part.scale([shape.scale] * 3)
-    if shape.draft == 0 and shape.headroom == 0:
-        return cavity
-    return cavity + _opening(array, shape, shape.headroom)
+def cast_solid(part: Part, solid: m3.Manifold, shape: MoldShape) -> m3.Manifold:
+    """What fills the mold of `solid` up to its rim, before it shrinks."""
+    cavity = solid.scale([shape.scale] * 3)
+    return cavity if shape.draft == shape.headroom == 0 else cavity + _opening(part, shape, shape.headroom)
 
 
-def _opening(array, shape, top) -> m3.Manifold:
+def _opening(part: Part, shape: MoldShape, top: float) -> m3.Manifold:
     """The space between the walls, from the base up to a height."""
-    half, bottom = np.array(array.plate) / 2 * shape.scale, -plate_thickness(array) * shape.scale
+    half, bottom = np.array(part.size) / 2 * shape.scale, -part.plate_thickness * shape.scale
     flare = (top - bottom) * math.tan(shape.draft)
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     rings = [np.column_stack([signs * (half + wider), np.full(4, z)]) for wider, z in ((0, bottom), (flare, top))]
     return m3.Manifold.hull_points(np.concatenate(rings))
 
 
-def mold_bounds(array: MicrolensArray, shape: MoldShape) -> Float[np.ndarray, "2 3"]:
+def mold_bounds(part: Part, shape: MoldShape) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the mold, mm."""
-    depth = float(array.substrate_thickness) * shape.scale
-    opening = np.array(array.plate) / 2 * shape.scale
-    opening = opening + (plate_thickness(array) * shape.scale + shape.headroom) * math.tan(shape.draft)
-    high = np.array([*(opening + shape.wall), shape.headroom])
-    return np.stack([[-high[0], -high[1], -depth - shape.floor], high])
+    flare = (part.plate_thickness * shape.scale + shape.headroom) * math.tan(shape.draft)
+    x, y = np.array(part.size) / 2 * shape.scale + flare + shape.wall
+    return np.array([[-x, -y, -part.thickness * shape.scale - shape.floor], [x, y, shape.headroom]])
 
 
-def mold_solid(array: MicrolensArray, part: m3.Manifold, shape: MoldShape = MoldShape()) -> m3.Manifold:
-    """The negative mold: a block less the cavity of `part`, which is `array_solid(array)`, marks and label."""
-    low, high = mold_bounds(array, shape)
-    block = m3.Manifold.cube((high - low).tolist()).translate(low.tolist())
-    opening = _opening(array, shape, shape.headroom + _OVERCUT)
-    tools = [part.scale([shape.scale] * 3), opening, *engraving_tools(array, shape)]
-    return _require_valid(block - m3.Manifold.batch_boolean(tools, m3.OpType.Add))
+def mold_solid(part: Part, solid: m3.Manifold, shape: MoldShape = MoldShape()) -> m3.Manifold:
+    """The negative mold: a block less the cavity of `solid`, which is `array_solid(part)`, marks and label."""
+    opening = _opening(part, shape, shape.headroom + _OVERCUT)
+    tools = [solid.scale([shape.scale] * 3), opening, *engraving_tools(part, shape)]
+    return _require_valid(m3.Manifold.batch_boolean([_box(*mold_bounds(part, shape)), *tools], m3.OpType.Subtract))
 
 
-def engraving_tools(array: MicrolensArray, shape: MoldShape) -> list[m3.Manifold]:
+def engraving_tools(part: Part, shape: MoldShape) -> list[m3.Manifold]:
     """Tools that cut the marks and the label into the rim."""
-    low, high = mold_bounds(array, shape)
+    low, high = mold_bounds(part, shape)
     middle = high[:2] - shape.wall / 2
-    plans = alignment_marks(array, shape) if shape.marks else []
+    plans = alignment_marks(part, shape) if shape.marks else []
     text = _label_outline(shape.label, height=0.4 * shape.wall, width=2 * (middle[0] - shape.wall))
     if not text.is_empty():
         plans.append(text.translate([0.0, -middle[1]]))
@@ -247,12 +215,11 @@ def engraving_tools(array: MicrolensArray, shape: MoldShape) -> list[m3.Manifold
     return [plan.extrude(depth + _OVERCUT).translate([0, 0, high[2] - depth]) for plan in plans]
 
 
-def alignment_marks(array: MicrolensArray, shape: MoldShape) -> list[m3.CrossSection]:
+def alignment_marks(part: Part, shape: MoldShape) -> list[m3.CrossSection]:
     """The crosses in the rim of the mold, in (x, y)."""
-    middle, arm = mold_bounds(array, shape)[1, :2] - shape.wall / 2, 0.6 * shape.wall
-    bar = m3.CrossSection.square([arm, arm / 6], center=True)
-    cross = bar + bar.rotate(90)
-    return [cross.translate([sx * middle[0], sy * middle[1]]) for sx, sy in ((-1, -1), (1, -1), (-1, 1))]
+    x, y = mold_bounds(part, shape)[1, :2] - shape.wall / 2
+    bar = m3.CrossSection.square([0.6 * shape.wall, 0.1 * shape.wall], center=True)
+    return [(bar + bar.rotate(90)).translate(at) for at in ([-x, -y], [x, -y], [-x, y])]
 
 
 def _label_outline(label: str, *, height: float, width: float) -> m3.CrossSection:
@@ -266,22 +233,21 @@ def _label_outline(label: str, *, height: float, width: float) -> m3.CrossSectio
     return text.translate([-(x0 + x1) / 2, -(y0 + y1) / 2]).scale([size, size])
 
 
-def lenslets_volume(array: MicrolensArray) -> float:
+def lenslets_volume(part: Part) -> float:
     """Volume of the lenses above the base, mm^3, by quadrature.
 
     Raises `InputError` if a lens lies outside the plate, or the plate is infinite.
     """
-    lenslets = lenslets_of(array)
-    if array.alike:
-        return _equal_lenslets_volume(lenslets[0], np.asarray(array.centers, float), array.plate)
+    if part.array.alike:
+        return _equal_lenslets_volume(part)
     # Gauss's rule of two nodes in each cell of a grid; errors where a lens or wall ends in a cell nearly cancel, 1e-7.
     count, offset = _VOLUME_SAMPLES // 2, np.array([-1, 1]) / (2 * math.sqrt(3))
-    x, y = (((np.arange(count)[:, None] + 0.5 + offset).ravel() / count - 0.5) * side for side in array.plate)
-    height, _ = surface_height(lenslets, np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2))
-    return float(height.mean() * math.prod(array.plate))
+    nodes = (np.arange(count)[:, None] + 0.5 + offset).ravel() / count - 0.5
+    x, y = (nodes * side for side in part.size)
+    return float(part.surface(x, y)[0].mean() * math.prod(part.size))
 
 
-def _equal_lenslets_volume(lenslet: Lenslet, centers, size) -> float:
+def _equal_lenslets_volume(part: Part) -> float:
     """Sum over the sectors of Voronoi cells, the borders of equal lenslets.
 
     In the direction `phi` a lenslet ends at `r = min(D/2, d / cos(phi))`, with `d` the distance of the cell's edge, and
@@ -289,12 +255,12 @@ def _equal_lenslets_volume(lenslet: Lenslet, centers, size) -> float:
     `dphi = du / cosh(u)` keeps the integrand smooth where the edge passes close to the vertex.
     """
     x, weights = np.polynomial.legendre.leggauss(64)
+    lenslet, edges = part.lenslets[0], cell_edges(part.centers, part.size)
     radius = lenslet.semi_aperture
 
     def radial_integral(r2):
         return r2 / 4 * ((lenslet.rim_sag - lenslet.sag(r2[..., None] * (1 + x) / 2)) @ weights)
 
-    edges = cell_edges(centers, size)
     # An edge through the vertex spans no sector.
     off, *ends = (values[edges.height > 1e-12] for values in (edges.height, edges.low, edges.high))
     half = np.sqrt(np.maximum(radius**2 - off**2, 0))
@@ -309,28 +275,24 @@ def _equal_lenslets_volume(lenslet: Lenslet, centers, size) -> float:
     return float((at_rim + (high - low)[:, 0] / 2 * (integrand @ weights)).sum())
 
 
-def array_volume(array: MicrolensArray) -> float:
+def array_volume(part: Part) -> float:
     """Volume of the array: plate and lenses, mm^3."""
-    return math.prod(array.plate) * plate_thickness(array) + lenslets_volume(array)
+    return math.prod(part.size) * part.plate_thickness + lenslets_volume(part)
 
 
-def mold_volume(array: MicrolensArray, shape: MoldShape) -> float:
+def mold_volume(part: Part, shape: MoldShape) -> float:
     """Volume of the mold: the block less lenses, opening, marks and label, mm^3."""
-    block = math.prod(np.diff(mold_bounds(array, shape), axis=0)[0])
-    depth = plate_thickness(array) * shape.scale + shape.headroom
-    flare = depth * math.tan(shape.draft)
-    areas = [math.prod(side * shape.scale + wider for side in array.plate) for wider in (0.0, flare, 2 * flare)]
-    opening = depth * (areas[0] + 4 * areas[1] + areas[2]) / 6
-    tools = engraving_tools(array, shape)
+    block = math.prod(np.diff(mold_bounds(part, shape), axis=0)[0])
+    tools = engraving_tools(part, shape)
     engraved = sum(tool.trim_by_plane([0, 0, -1], -shape.headroom).volume() for tool in tools)
-    return block - shape.scale**3 * lenslets_volume(array) - opening - engraved
+    opening = _opening(part, shape, shape.headroom).volume()
+    return block - shape.scale**3 * lenslets_volume(part) - opening - engraved
 
 
-def volume_tolerance(array: MicrolensArray, chord: float) -> float:
+def volume_tolerance(part: Part, chord: float) -> float:
     """Relative tolerance of a volume: at least `VOLUME_TOLERANCE`, more for coarse facets.
 
     Facets are unbiased except at rims, where a quarter of the chordal tolerance bounds them; walls are within it.
     """
-    height = lenslet_height(array)
-    walls = sum(2 * math.pi * each.semi_aperture * (height - each.rim_sag) for each in lenslets_of(array))
-    return max(VOLUME_TOLERANCE, chord * (math.prod(array.plate) / 4 + walls) / array_volume(array))
+    walls = sum(2 * math.pi * lenslet.semi_aperture * (part.height - lenslet.rim_sag) for lenslet in part.lenslets)
+    return max(VOLUME_TOLERANCE, chord * (math.prod(part.size) / 4 + walls) / array_volume(part))

@@ -21,7 +21,7 @@ from ...design.design import Design
 from ...geometry import Imager
 from ...layers import layers_in_front
 from ...layouts import cell_edges, on_sensor, plate_corners
-from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
+from ...mold.lenslets import Part
 from ...optics import theory
 from ...optics.psf import least_samples, spot_image
 from ...optics.raytrace import to_numpy
@@ -136,10 +136,9 @@ def _glass(design: Design, imager: Imager, plano: bool, thickness: float, width:
     x = np.linspace(-width / 2, width / 2, _SECTION_POINTS)
     depth = np.zeros_like(x)
     if design.lens.focal_length_mm is None:
-        lenslets = lenslets_of(imager.array)
-        y = min((each.center for each in lenslets), key=lambda center: float(np.hypot(*center)))[1]
-        points = np.column_stack([x, np.full_like(x, y)])
-        depth = lenslet_height(imager.array) - surface_height(lenslets, points)[0]
+        part = Part(imager.array)
+        y = part.centers[np.hypot(*part.centers.T).argmin(), 1:]
+        depth = part.height - part.surface(x, y)[0][0]
     curved, flat = (thickness - depth, 0.0) if plano else (depth, thickness)
     corners = [*zip(curved, x, strict=True), (flat, width / 2), (flat, -width / 2)]
     return " ".join(f"{z:.4f},{at:.4f}" for z, at in corners)

@@ -17,6 +17,7 @@ from ...design.design import Design, span_of
 from ...grid import Grid
 from ...io.files import read_text
 from ...lenses import MicrolensArray
+from ...mold.lenslets import Part
 from ...mold.solids import MoldShape, preview_solid
 from ...pictures import block_maxima, display_range, downsample, png_uri, shade, to_base64, to_uint8
 from ...typing import PathLike
@@ -300,7 +301,7 @@ def point_view(points: Float[np.ndarray, "point 4"], grid: Grid | None) -> dict[
 
 def mold_view(array: MicrolensArray) -> dict[str, Any]:
     """The mold for the browser."""
-    mesh = preview_solid(array, MoldShape()).to_mesh64()
+    mesh = preview_solid(Part(array), MoldShape()).to_mesh64()
     return mesh_view(mesh.vert_properties[:, :3], mesh.tri_verts)
 
 
