@@ -23,7 +23,7 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of
 from experiments.ray_tracer import traced
 from gs_jax import Imager
 from gs_jax.base.progress import Progress
-from gs_jax.calibration.sources import find_spots
+from gs_jax.calibration.spots import find_spots
 from gs_jax.design.design import Design
 from gs_jax.io.captures import read_capture
 

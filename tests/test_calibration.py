@@ -34,11 +34,10 @@ from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
-from gs_jax.calibration.initial_guess import guess_without_lenses
-from gs_jax.calibration.misfits import alternatives
-from gs_jax.calibration.pattern_matching import match_pattern, match_shift
-from gs_jax.calibration.sources import Sources, Spots, find_spots
+from gs_jax.calibration.initial_guess import guess_without_lenses, match_pattern, match_shift
+from gs_jax.calibration.sources import Sources, Spots, alternatives
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
+from gs_jax.calibration.spots import find_spots
 from gs_jax.cli.calibrate import FIT_NAMES
 from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout

@@ -23,7 +23,7 @@ from gs_jax import (
 )
 from gs_jax.__main__ import commands
 from gs_jax.calibration.fit import PATTERN_FITTED
-from gs_jax.calibration.pattern_matching import match_pattern
+from gs_jax.calibration.initial_guess import match_pattern
 from gs_jax.calibration.spots import find_blurred_spots, half_light_radii
 from gs_jax.io.camera import Readout
 from gs_jax.io.captures import read_capture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gs_jax as gs
-from gs_jax.calibration.sample import with_sample
+from gs_jax.calibration.calibrated_design import with_sample
 from gs_jax.io.provenance import DepthFrame, frame_of
 from gs_jax.widget.layers import reader
 

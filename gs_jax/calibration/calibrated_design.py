@@ -11,16 +11,17 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from ..base.errors import InputError
-from ..design.conversion import medium_in_words
+from ..design.conversion import default_sample, layers_of, medium_in_words, sample_table, sample_tables
 from ..design.design import Design
 from ..design.tables import LENS_KEYS, CalibrationTable
 from ..design.validation import reach
 from ..geometry import Imager
 from ..io.provenance import Provenance
 from ..io.toml import one_line
+from ..layers import Layers
 from ..lenses import EACH, MicrolensArray
+from ..materials import index_of
 from .fit import Calibration
-from .sample import with_sample
 
 # Length of the longest arrow in the figure, in sides of the sensor.
 _LONGEST = 0.08
@@ -41,11 +42,13 @@ def apply_calibration(
     imager = result.imager
     if not {"sample_at_mm", "sample_index"}.isdisjoint(result.values):
         design = with_sample(design, imager, sample)
-    one = lambda value: float(f"{float(value):.9g}")
+
+    def rounded(value) -> float:
+        return float(f"{float(value):.9g}")
 
     def pair(values) -> tuple[float, float]:
         x, y = np.asarray(values, np.float64)
-        return one(x), one(y)
+        return rounded(x), rounded(y)
 
     centers = np.asarray(imager.array.centers, np.float64)
     # The plate may be larger than designed, or lenses found beyond it.
@@ -55,7 +58,7 @@ def apply_calibration(
     lens = design.lens.model_copy(update=_lens_lists(imager.array))
     tilt = (0.0, 0.0) if imager.tilt is None else np.degrees(np.arctan(imager.tilt))
     pose = CalibrationTable(
-        rotation_deg=one(np.degrees(imager.rotation)), shift_mm=pair(imager.shift), tilt_deg=pair(tilt)
+        rotation_deg=rounded(np.degrees(imager.rotation)), shift_mm=pair(imager.shift), tilt_deg=pair(tilt)
     )
     record: dict[str, Any] = {
         **(provenance or {}),
@@ -64,10 +67,10 @@ def apply_calibration(
         "calibrated_captures": len(np.unique(result.sources.captures[result.spots.sources])),
         "calibrated_in": medium_in_words(imager),
         "mirrored": result.mirrored,
-        "calibrated_values": {name: float(f"{value:.9g}") for name, value in result.values.items()},
+        "calibrated_values": {name: rounded(value) for name, value in result.values.items()},
         "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in result.deviations.items()},
     }
-    imaging = design.imaging.model_copy(update={"sensor_distance_mm": one(imager.sensor_distance)})
+    imaging = design.imaging.model_copy(update={"sensor_distance_mm": rounded(imager.sensor_distance)})
     tables = {"array": array, "lens": lens, "imaging": imaging, "calibration": pose}
     new = design.model_copy(update=tables | {"provenance": {**design.provenance, **record}})
     distance, radius = reach(new)
@@ -83,6 +86,33 @@ def apply_calibration(
         raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
 
 
+def with_sample(design: Design, imager: Imager, name: str | None) -> Design:
+    """The design with the sample of an imager as `[sample]`, or as the one of `[samples]` with this name.
+
+    What is named in the design, materials and layers, keeps its name where it has the same numbers. A fit of the
+    surface may have made the device's layers behind the gap of air the sample's, with which they move.
+    """
+    sample, wavelength = imager.sample, 1e6 * float(imager.wavelength)
+    before = default_sample(design) if name is None else sample_table(design, name)
+    assert sample is not None
+    found = sample_tables(sample)
+    if np.isclose(index_of(before.refractive_index, wavelength), float(sample.refractive_index), rtol=1e-6):
+        found["refractive_index"] = before.refractive_index
+    if _alike(layers_of(before.layers[::-1], wavelength), sample.layers):
+        found["layers"] = before.model_dump()["layers"]
+    kept = design.layers.object[: 0 if imager.filters is None else len(imager.filters.thickness)]
+    layers = design.layers.model_copy(update={"object": kept})
+    if name in design.samples:
+        return design.replace(layers=layers, samples={**design.samples, name: found})
+    return design.replace(layers=layers, sample=found)
+
+
+def _alike(one: Layers | None, other: Layers | None) -> bool:
+    if one is None or other is None or len(one.thickness) != len(other.thickness):
+        return False
+    return np.allclose(np.array(one.slabs), np.array(other.slabs), rtol=1e-6)
+
+
 def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:
     """Keys of `[lens]` with a number for each lens, by the fewest decimals that give the array's numbers."""
     numbers = {key: name for key, name in zip(LENS_KEYS, EACH, strict=True) if getattr(array, name).ndim}
@@ -94,16 +124,13 @@ def summary_table(design: Design, result: Calibration, start: Imager) -> Table:
     """Designed and calibrated values, with standard errors; `start` is the imager that the calibration was given."""
     table = Table("", "design", "found", "SD", box=None, pad_edge=False)
     pose = design.calibration
-    before = {
-        "sensor_distance_mm": design.imaging.sensor_distance_mm,
-        "rotation_deg": pose.rotation_deg,
-        **dict(zip(("shift_x_mm", "shift_y_mm"), pose.shift_mm, strict=True)),
-        **dict(zip(("tilt_x_deg", "tilt_y_deg"), pose.tilt_deg, strict=True)),
-        "scale": 1.0,
-        "depth_offset_mm": 0.0,
-        **({} if start.sample is None else {"sample_at_mm": float(start.sample_surface)}),
-        **({} if start.sample is None else {"sample_index": float(start.sample.refractive_index)}),
-    }
+    before = {"sensor_distance_mm": design.imaging.sensor_distance_mm, "rotation_deg": pose.rotation_deg}
+    before |= zip(("shift_x_mm", "shift_y_mm"), pose.shift_mm, strict=True)
+    before |= zip(("tilt_x_deg", "tilt_y_deg"), pose.tilt_deg, strict=True)
+    before |= {"scale": 1.0, "depth_offset_mm": 0.0}
+    if start.sample is not None:
+        before |= {"sample_at_mm": float(start.sample_surface)}
+        before |= {"sample_index": float(start.sample.refractive_index)}
     for name, value in result.values.items():
         table.add_row(name, f"{before[name]:.6g}", f"{value:.6g}", f"{result.deviations[name]:.2g}")
     return table
@@ -135,33 +162,10 @@ def _round_down(length: float) -> float:
 
 def plot_residuals(result: Calibration) -> Figure:
     """Residuals of all spots on the sensor, a histogram of their lengths, and the pattern's scale by depth."""
-    sensor, distance = result.imager.sensor, np.hypot(*result.residuals.T)
     figure = Figure(figsize=(14, 5), dpi=100, layout="constrained")
     arrows, counts, lines = figure.subplots(1, 3)
-    side = max(sensor.shape) * sensor.pixel_pitch
-    scale = max(float(distance.max()), 1e-12) / (_LONGEST * side)
-    of = result.sources.captures[result.spots.sources]
-    for number in (numbers := np.unique(of)):
-        mine = of == number
-        colour = colormaps["viridis"](float(np.searchsorted(numbers, number)) / max(len(numbers) - 1, 1) * _DARKEST)
-        drawn = arrows.quiver(
-            *result.spots.positions[mine].T,
-            *result.residuals[mine].T,
-            color=colour,
-            angles="xy",
-            scale_units="xy",
-            scale=scale,
-            width=_ARROW,
-        )
-        drawn.set_label(f"capture {number + 1}")
-        if number == numbers[0]:
-            length = _round_down(float(distance.max()))
-            arrows.quiverkey(drawn, 0.03, 1.04, length, f"{length:g} pixels", labelpos="E", color="k")
-    arrows.set(xlim=sensor.extent[:2], ylim=sensor.extent[2:], aspect="equal", xlabel="x, mm", ylabel="y, mm")
-    arrows.set_title("predicted less observed spots, on the sensor", pad=22)
-    if 1 < len(numbers) <= _MOST_NAMED:
-        handles = [Line2D([], [], color=drawn.get_facecolor(), label=drawn.get_label()) for drawn in arrows.collections]
-        arrows.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
+    _draw_arrows(arrows, result)
+    distance = np.hypot(*result.residuals.T)
     counts.hist(distance, bins=30)
     counts.set(xlabel="length of the residual, pixels", ylabel="number of spots")
     counts.set_title(f"{len(distance)} spots, {result.rms:.3f} pixels RMS")
@@ -179,3 +183,27 @@ def plot_residuals(result: Calibration) -> Figure:
     lines.set_title(f"scale by depth (Eq. 1), off by up to {worst:.1e}")
     lines.legend(fontsize=9)
     return figure
+
+
+def _draw_arrows(axes, result: Calibration) -> None:
+    """Residuals on the sensor, in the colors of their captures."""
+    sensor, longest = result.imager.sensor, max(float(np.hypot(*result.residuals.T).max()), 1e-12)
+    numbers, index = np.unique(result.sources.captures[result.spots.sources], return_inverse=True)
+    colors = colormaps["viridis"](np.linspace(0, _DARKEST, len(numbers)))
+    drawn = axes.quiver(
+        *result.spots.positions.T,
+        *result.residuals.T,
+        color=colors[index],
+        angles="xy",
+        scale_units="xy",
+        scale=longest / (_LONGEST * max(sensor.shape) * sensor.pixel_pitch),
+        width=_ARROW,
+    )
+    length = _round_down(longest)
+    axes.quiverkey(drawn, 0.03, 1.04, length, f"{length:g} pixels", labelpos="E", color="k")
+    axes.set(xlim=sensor.extent[:2], ylim=sensor.extent[2:], aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    axes.set_title("predicted less observed spots, on the sensor", pad=22)
+    if 1 < len(numbers) <= _MOST_NAMED:
+        named = zip(numbers, colors, strict=True)
+        handles = [Line2D([], [], color=color, label=f"capture {number + 1}") for number, color in named]
+        axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)

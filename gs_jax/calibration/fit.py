@@ -22,18 +22,8 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
-from .initial_guess import (
-    InitialGuess,
-    explained,
-    guess_from_pattern,
-    guess_from_pose,
-    guess_without_lenses,
-    search_rotation,
-)
-from .jackknife import jackknife_errors
-from .misfits import best_alternative, describe_misfit, would_fit
-from .pattern_matching import MIN_SPOTS
-from .sample import OF_SAMPLE, check_fitted_sample, with_surface
+from . import initial_guess as guesses, spot_model as model
+from .initial_guess import MIN_SPOTS, InitialGuess
 from .sources import (
     CaptureFit,
     MisfitError,
@@ -41,31 +31,12 @@ from .sources import (
     SpotLists,
     Spots,
     assign_spots,
+    best_alternative,
     capture_fits,
-    find_blurred_spots_mm,
-    find_spots_mm,
+    describe_misfit,
 )
-from .spot_model import (
-    FITTABLE,
-    FITTED,
-    NOISE,
-    OUTLIER,
-    CoreOffsets,
-    Observations,
-    Unknowns,
-    apply_to_imager,
-    check_determined,
-    estimate_noise,
-    initial_unknowns,
-    match_radius,
-    named_values,
-    residuals,
-    source_points,
-    standard_errors,
-    trace_core_offsets,
-    weighted_residuals,
-)
-from .spots import NARROW_WINDOW
+from .spot_model import FITTABLE, FITTED, OF_SAMPLE, CoreOffsets, Observations, Unknowns
+from .spots import NARROW_WINDOW, find_blurred_spots_mm, find_spots_mm
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)
@@ -78,7 +49,7 @@ _MAX_STEPS = 300
 _MULTIPLE = 256
 # Least median of the distances of blurred spots' coordinates from a fit, pixels, and the width in that of a sharp spot
 # over it: the loss is linear beyond two standard deviations.
-_LEAST_BLURRED, _OVER_MEDIAN = 0.01, 2 / 0.6745 / OUTLIER
+_LEAST_BLURRED, _OVER_MEDIAN = 0.01, 2 / 0.6745 / model.OUTLIER
 # What is guessed from the pattern of the lenses, if it is fitted.
 _POSE = ("sensor_distance", "rotation", "shift")
 # What the pattern of the lenses alone determines.
@@ -187,10 +158,10 @@ def calibrate(
     >>> array = gs.MicrolensArray(gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
     >>> listed = gs.Imager(array, gs.Sensor((600, 600), 0.0135), sensor_distance=5.8, field_radius=3.0)
     >>> true = dataclasses.replace(listed, sensor_distance=5.9, rotation=0.02)
-    >>> places = np.array([[0.0, 0.0, 18.0], [0.5, 0.3, 20.0], [0.0, 0.0, 22.0]])  # one source a capture
-    >>> images = [gs.simulate(np.array([[*place, 1.0]]), true, optics="near", psf="geometric") for place in places]
-    >>> found = gs.calibrate(images, places, listed, fit=("sensor_distance", "rotation"))
-    >>> print(round(float(found.imager.sensor_distance), 1), round(float(found.imager.rotation), 3), found.mirrored)
+    >>> points = np.array([[0.0, 0.0, 18.0], [0.5, 0.3, 20.0], [0.0, 0.0, 22.0]])  # one source a capture
+    >>> images = [gs.simulate(np.array([[*point, 1.0]]), true, optics="near", psf="geometric") for point in points]
+    >>> result = gs.calibrate(images, points, listed, fit=("sensor_distance", "rotation"))
+    >>> print(round(float(result.imager.sensor_distance), 1), round(float(result.imager.rotation), 3), result.mirrored)
     5.9 0.02 False
     """
     progress = progress or Progress()
@@ -201,84 +172,105 @@ def calibrate(
     sources.check(len(images), imager, fit, blurred)
     if blurred and (count := len(imager.array.centers)) < MIN_SPOTS:
         raise InputError(f"captures: a pattern needs an array of {MIN_SPOTS} lenses or more, got {count}.")
-    imager = with_surface(imager, fit)
+    imager = model.with_surface(imager, fit)
     for number, image in enumerate(images, 1):
         _check_image(f"capture {number}", image, imager)
+
+    def spots_of(number: int):
+        if number in blurred:
+            return find_blurred_spots_mm(images[number], imager)
+        return find_spots_mm(images[number], imager, int((sources.captures == number).sum())), 1.0
+
     # SciPy's filters release the GIL.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as threads:
-        work = [
-            threads.submit(_spots_of, number, image, imager, sources, blurred) for number, image in enumerate(images)
-        ]
-        found = [one.result() for one, _ in zip(work, progress.track(images, "Finding spots"), strict=True)]
-    spots, blur = [each for each, _ in found], np.array([width for _, width in found])
-    sources = sources._replace(blur=blur)
-    unknown = np.isnan(sources.points)
-    cache: dict = {}
+        results = threads.map(spots_of, range(len(images)))
+        tracked = zip(results, progress.track(images, "Finding spots"), strict=True)
+        spots, widths = zip(*(result for result, _ in tracked), strict=True)
+    sources = sources._replace(blur=np.array(widths))
+    search = _Search(images, list(spots), imager, fit, find_lenses, np.isnan(sources.points), {})
 
-    def guess(meant: Sources) -> InitialGuess:
-        if find_lenses:
-            initial = guess_without_lenses(spots, meant, imager, images)
-        elif set(fit).isdisjoint(_POSE):
-            initial = guess_from_pose(spots, meant, imager)
-        else:
-            initial = guess_from_pattern(spots, meant, imager, free_scale="scale" in fit, cache=cache)
-        held = [name for name in _POSE[: 1 if find_lenses else None] if name not in fit]
-        where = lambda i: [getattr(i, name) for name in held]
-        return initial._replace(imager=eqx.tree_at(where, initial.imager, where(imager)) if held else initial.imager)
-
-    def fit_guess(initial: InitialGuess, progress: Progress | None = None) -> Calibration:
-        if not find_lenses:
-            return refine(spots, initial.imager, initial.sources._replace(blur=blur), unknown, fit, progress=progress)
-        names = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
-        lens_sd = _UNLISTED * match_radius(initial.imager.array.centers)
-        return refine(spots, initial.imager, initial.sources, unknown, names, lens_sd, progress)
-
-    def alternative() -> tuple[str, float] | None:
+    def remedy() -> str | None:
         with progress.step("Trying other positions"):
-            return best_alternative(
-                sources, lambda meant: explained(spots, guess(meant)), lambda meant: fit_guess(guess(meant)).captures
-            )
+            return best_alternative(sources, search.explain, lambda changed: search.fit(changed).captures)
 
     try:
         with progress.step("Matching lenses"):
-            initial = guess(sources)
+            initial = search.guess(sources)
     except InputError as error:
-        if (other := alternative()) is None:
+        if (other := remedy()) is None:
             raise
-        raise InputError(f"{str(error).rstrip('.?')}; {would_fit(other)}") from error
+        raise InputError(f"{str(error).rstrip('.?')}; {other}") from error
     if initial.scale != 1:
         # Windows are as large as the pattern turned out to be.
+        assert initial.sources.blur is not None
         for k in blurred:
-            spots[k], blur[k] = find_blurred_spots_mm(images[k], initial.imager)
+            search.spots[k], initial.sources.blur[k] = find_blurred_spots_mm(images[k], initial.imager)
     try:
-        result = fit_guess(initial, progress)
+        result = search.refine(initial, progress)
     except MisfitError as error:
-        raise MisfitError(error.fits, describe_misfit(error.fits, alternative())) from error
+        raise MisfitError(error.fits, describe_misfit(error.fits, remedy())) from error
     if find_lenses:
         return _drop_unseen_lenses(result)
     if blurred:
-        # Where the middle of a wide spot is depends on the window that looks.
-        for k in blurred:
-            spots[k], _ = find_blurred_spots_mm(images[k], initial.imager, NARROW_WINDOW)
-        try:
-            narrow = fit_guess(initial).values
-        except InputError:
-            text = "wide spots are not found through a narrower window: standard deviations leave out what it changes."
-            warnings.warn(InputWarning(text), stacklevel=2)
-            narrow = result.values
-        for name, value in result.values.items():
-            result.deviations[name] = float(np.hypot(result.deviations[name], value - narrow[name]))
+        _add_change_by_window(result, search, initial, blurred)
     if "scale" in fit:
         for numbers in (result.values, result.deviations):
             numbers["scale"] *= initial.scale
     return result._replace(mirrored=initial.mirrored)
 
 
-def _spots_of(number: int, image: Image, imager: Imager, sources: Sources, blurred: Collection[int]):
-    """The spots of a capture, and their width in that of a sharp one."""
-    if number in blurred:
-        return find_blurred_spots_mm(image, imager)
-    return find_spots_mm(image, imager, int((sources.captures == number).sum())), 1.0
+class _Search(NamedTuple):
+    """Initial guesses and fits for sources that captures may show; `unknown` coordinates `(source, 3)` are fitted."""
+
+    images: Sequence[Image]
+    spots: list[Float64[np.ndarray, "_ 2"]]
+    imager: Imager
+    names: Sequence[str]
+    find_lenses: bool
+    unknown: np.ndarray
+    # Matches of patterns, see `guess_from_pattern`.
+    cache: dict
+
+    def guess(self, sources: Sources) -> InitialGuess:
+        if self.find_lenses:
+            initial = guesses.guess_without_lenses(self.spots, sources, self.imager, self.images)
+        elif set(self.names).isdisjoint(_POSE):
+            initial = guesses.guess_from_pose(self.spots, sources, self.imager)
+        else:
+            free = "scale" in self.names
+            initial = guesses.guess_from_pattern(self.spots, sources, self.imager, free_scale=free, cache=self.cache)
+        held = [name for name in _POSE[: 1 if self.find_lenses else None] if name not in self.names]
+        values = {name: getattr(self.imager, name) for name in held}
+        return initial._replace(imager=guesses.posed(initial.imager, **values))
+
+    def refine(self, initial: InitialGuess, progress: Progress | None = None) -> Calibration:
+        names, lens_sd = self.names, _PRINTED
+        if self.find_lenses:
+            names = [*(name for name in names if name in ("sensor_distance", "depth_offset")), "lenses"]
+            lens_sd = _UNLISTED * model.match_radius(initial.imager.array.centers)
+        return refine(self.spots, initial.imager, initial.sources, self.unknown, names, lens_sd, progress)
+
+    def explain(self, sources: Sources) -> list[CaptureFit]:
+        """What the initial guess explains of each capture."""
+        return guesses.explained(self.spots, self.guess(sources))
+
+    def fit(self, sources: Sources) -> Calibration:
+        return self.refine(self.guess(sources))
+
+
+def _add_change_by_window(result: Calibration, search: _Search, initial: InitialGuess, blurred) -> None:
+    """Add to the deviations what a narrower window changes: the middle of a wide spot depends on the window."""
+    spots = list(search.spots)
+    for k in blurred:
+        spots[k], _ = find_blurred_spots_mm(search.images[k], initial.imager, NARROW_WINDOW)
+    try:
+        narrow = search._replace(spots=spots).refine(initial).values
+    except InputError:
+        text = "wide spots are not found through a narrower window: standard deviations leave out what it changes."
+        warnings.warn(InputWarning(text), stacklevel=3)
+        return
+    for name, value in result.values.items():
+        result.deviations[name] = float(np.hypot(result.deviations[name], value - narrow[name]))
 
 
 def _drop_unseen_lenses(result: Calibration) -> Calibration:
@@ -311,53 +303,53 @@ def refine(
     standard deviation of lenses, mm. `InputError` if the spots do not determine what is to be fitted.
     """
     fit = [name for name in FITTABLE if name in fit]
-    radius, solver = match_radius(imager.array.centers), optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    radius, solver = model.match_radius(imager.array.centers), optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
     current, points, state = imager, sources.points, None
     assigned = data = None
+
+    def fits(off=None) -> list[CaptureFit]:
+        assert assigned is not None
+        return capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch, off)
+
     for within in (progress or Progress()).track(_WITHIN, "Fitting"):
         if assigned is not None and data is not None:
-            sources = _reweight(sources, assigned, np.asarray(residuals(state, data))[: len(assigned.lenses)])
-        offsets = trace_core_offsets(current, points[sources.sharp, 2], fit)
+            sources = _reweight(sources, assigned, np.asarray(model.residuals(state, data))[: len(assigned.lenses)])
+        offsets = model.trace_core_offsets(current, points[sources.sharp, 2], fit)
         assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
         if not len(assigned.lenses):
-            _check_captures(capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch))
+            _check_captures(fits())
         data = _observations(imager, sources, unknown, assigned, offsets)
-        state = state or initial_unknowns(fit, data)
+        state = state or model.initial_unknowns(fit, data)
         if not jax.tree.leaves(state):
             raise InputError(f"calibration: fit one or more of {', '.join(FITTABLE)}, got nothing to fit.")
-        _check_determined(standard_errors(state, data, lens_sd, NOISE), radius, spots, sources, assigned, imager)
+        try:
+            model.check_determined(model.standard_errors(state, data, lens_sd, model.NOISE), radius)
+        except InputError:
+            # Perhaps for lack of captures whose spots would have been needed.
+            _check_captures(fits())
+            raise
         args = data, jnp.asarray(lens_sd, data.positions.dtype)
-        state = optx.least_squares(weighted_residuals, solver, state, args, throw=False, max_steps=_MAX_STEPS).value
+        options = {"throw": False, "max_steps": _MAX_STEPS}
+        state = optx.least_squares(model.weighted_residuals, solver, state, args, **options).value
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
-            fits = capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch)
-            _check_captures([fit._replace(fits=False) for fit in fits])
-        current, points = apply_to_imager(state, imager), np.asarray(source_points(state, data), np.float64)
+            _check_captures([fit._replace(fits=False) for fit in fits()])
+        current, points = model.apply_to_imager(state, imager), np.asarray(model.source_points(state, data), np.float64)
     assert state is not None and assigned is not None and data is not None
-    check_fitted_sample(current)
-    off = np.asarray(residuals(state, data), np.float64)[: len(assigned.lenses)]
-    fits = capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch, off)
-    _check_captures(fits)
+    model.check_fitted_sample(current)
+    off = np.asarray(model.residuals(state, data), np.float64)[: len(assigned.lenses)]
+    _check_captures(captures := fits(off))
     over_width = off / sources.blurs[assigned.sources, None]
-    errors = standard_errors(state, data, lens_sd, estimate_noise(over_width, state, assigned.lenses))
-    check_determined(errors, radius)
-    for name, error in jackknife_errors(state, data, lens_sd).items():
+    errors = model.standard_errors(state, data, lens_sd, model.estimate_noise(over_width, state, assigned.lenses))
+    model.check_determined(errors, radius)
+    for name, error in model.jackknife_errors(state, data, lens_sd).items():
         errors[name] = max(errors[name], error)
     sources = sources._replace(points=points)
-    return Calibration(current, False, named_values(state), errors, sources, assigned, off, fits)
+    return Calibration(current, False, model.named_values(state), errors, sources, assigned, off, captures)
 
 
 def _check_captures(fits: Sequence[CaptureFit]) -> None:
     if not all(fit.fits for fit in fits):
         raise MisfitError(fits, describe_misfit(fits, None, tried=False))
-
-
-def _check_determined(errors, radius: float, spots: SpotLists, sources: Sources, assigned: Spots, imager: Imager):
-    """`check_determined`, after captures whose spots would have been needed."""
-    try:
-        check_determined(errors, radius)
-    except InputError:
-        _check_captures(capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch))
-        raise
 
 
 def _reweight(sources: Sources, spots: Spots, off) -> Sources:
@@ -380,22 +372,21 @@ def spot_residuals(
 ) -> Float64[np.ndarray, "spot 2"]:
     """Residuals of captures of other points under a calibration, `(x, y)`, pixels."""
     imager, sources = result.imager, Sources(points, np.arange(len(points)))
-    offsets, spots = trace_core_offsets(imager, points[:, 2]), [find_spots_mm(image, imager) for image in images]
-    assigned = assign_spots(spots, sources, imager, offsets, match_radius(imager.array.centers))
+    offsets, spots = model.trace_core_offsets(imager, points[:, 2]), [find_spots_mm(image, imager) for image in images]
+    assigned = assign_spots(spots, sources, imager, offsets, model.match_radius(imager.array.centers))
     data = _observations(imager, sources, np.zeros_like(points, bool), assigned, offsets)
-    return np.asarray(residuals(Unknowns(), data), np.float64)[: len(assigned.lenses)]
+    return np.asarray(model.residuals(Unknowns(), data), np.float64)[: len(assigned.lenses)]
 
 
 def _observations(imager: Imager, sources: Sources, unknown, spots: Spots, offsets: CoreOffsets) -> Observations:
-    size = -(-max(len(spots.lenses), 1) // _MULTIPLE) * _MULTIPLE
-    dtype = imager.sensor_distance.dtype
-    of, lenses, positions = (np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)]) for part in spots[:3])
+    count, dtype = len(spots.lenses), imager.sensor_distance.dtype
+    more = -count % _MULTIPLE if count else _MULTIPLE
+    of, lenses = (np.pad(values, (0, more)) for values in (spots.sources, spots.lenses))
+    positions = np.pad(spots.positions.astype(dtype), ((0, more), (0, 0)))
     points, blur = sources.points.astype(dtype), np.asarray(sources.blurs, dtype)[of]
-    valid, unknown = np.arange(size) < len(spots.lenses), np.argwhere(unknown)
-    # JAX would compile programs to make arrays of these shapes.
-    points, unknown, of, lenses = map(jax.device_put, (points, unknown, of, lenses))
-    positions, valid, blur = map(jax.device_put, (positions.astype(dtype), valid, blur))
-    return Observations(imager, points, unknown, of, lenses, positions, valid, blur, offsets)
+    arrays = points, np.argwhere(unknown), of, lenses, positions, np.arange(count + more) < count, blur
+    # `device_put`, as JAX would compile programs to make arrays of these shapes.
+    return Observations(imager, *map(jax.device_put, arrays), offsets=offsets)
 
 
 def self_calibrate(
@@ -432,12 +423,12 @@ def self_calibrate(
     if other := [name for name in fit if name not in _SELF_FITTABLE]:
         allowed = f"{', '.join(_SELF_FITTABLE[:-1])} and {_SELF_FITTABLE[-1]}"
         raise InputError(f"fit must be some of {allowed} for a scene, got {', '.join(other)}.")
-    imager = with_surface(imager, fit)
+    imager = model.with_surface(imager, fit)
     _check_image("capture", image, imager)
     depths = np.asarray(grid.depths, np.float64)
     with progress.step("Searching for the rotation"):
         spots = find_spots_mm(image, imager, _ROTATION_SOURCES)
-        rotated = search_rotation(spots, imager, (depths.min(), depths.max())) if "rotation" in fit else imager
+        rotated = guesses.search_rotation(spots, imager, (depths.min(), depths.max())) if "rotation" in fit else imager
     points = find_points(image, rotated, grid, progress=progress)[:_MOST_POINTS, :3]
     if len(points) < _MIN_POINTS:
         needs = f"a sparse scene in focus with {_MIN_POINTS} or more points is needed"

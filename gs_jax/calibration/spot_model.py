@@ -1,11 +1,16 @@
 """The least-squares problem of a calibration: unknowns, predicted spots, residuals, and standard errors.
 
 Spots are predicted on chief rays, with the offsets of their bright cores by exact rays.
+
+The Gauss-Newton covariance takes residuals as independent. Those of neighbouring lenses are not where something smooth
+is not modelled: a stretch, a distortion, uneven light within discs. Estimates without a block of neighbouring lenses
+then differ by more (jackknife).
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,11 +21,11 @@ from jaxtyping import Array, Bool, Float, Float64, Int
 
 from ..base.errors import InputError
 from ..geometry import Imager
+from ..layers import Layers, object_surface
 from ..layouts import nearest_neighbour_distances
 from ..lenses import MicrolensArray, lenses_by_type
 from ..optics.lens_types import split_by_type
 from ..optics.pupil import PupilSamples, aperture_profile, sample_pupil
-from .sample import OF_SAMPLE, number
 
 # Fields at which exact rays are traced, degree of the polynomial through them, and number of depths at most.
 _FIELDS, _DEGREE, _DEPTHS = 13, 7, 5
@@ -36,6 +41,9 @@ OUTLIER, NOISE = 0.5, 0.1
 _MIN_NOISE = 0.01
 # Relative singular value below which a direction is undetermined, and its least component that counts.
 _SINGULAR, _COMPONENT = 1e-6, 1e-2
+# Most blocks that are left out: few enough that a block is wider than what is alike in it, enough for a standard error
+# to a fifth. Reciprocal condition number below which spots without a block determine nothing.
+_BLOCKS, _SINGULAR_BLOCK = 16, 1e-12
 # Names and units in files of the fields of `Unknowns`, and the standard error beyond which a value is undetermined;
 # lengths are relative to `match_radius`.
 _NAMES = {
@@ -54,6 +62,8 @@ _MATCH_RADIUS = 0.0488
 _BLURRED_RADIUS = 5.0
 
 FITTED = ("sensor_distance", "rotation", "shift", "tilt")
+# Where the sample begins, mm, and its refractive index.
+OF_SAMPLE = ("sample_at", "sample_index")
 OF_DEVICE = (*FITTED, "scale", "depth_offset", "lenses")
 FITTABLE = (*OF_DEVICE, *OF_SAMPLE)
 # What core offsets depend on in one step of a fit, beside depth and field.
@@ -111,6 +121,51 @@ class Observations(NamedTuple):
     valid: Bool[Array, " spot"]
     blur: Float[Array, " spot"]
     offsets: CoreOffsets
+
+
+def number(imager: Imager, name: str) -> Any:
+    """A number of the imager, or of its sample by a name of `OF_SAMPLE`."""
+    sample: Any = imager.sample
+    of_sample = {"sample_at": "surface", "sample_index": "refractive_index"}
+    return getattr(sample, of_sample[name]) if name in of_sample else getattr(imager, name)
+
+
+def with_surface(imager: Imager, fit: Sequence[str]) -> Imager:
+    """The imager with a surface of its sample, if that is to be fitted: the layers behind the last gap of air are its.
+
+    `InputError` if the imager has no sample, or one without such a gap.
+    """
+    fitted = [name for name in fit if name in OF_SAMPLE]
+    sample, filters = imager.sample, imager.filters
+    if fitted and sample is None:
+        raise InputError(f"fit: {fitted[0]} needs a microscope with a sample, got one in air.")
+    if sample is None or "sample_at" not in fitted or sample.surface is not None:
+        return imager
+    gaps = [] if filters is None else np.flatnonzero(np.asarray(filters.refractive_index) == 1)
+    if filters is None or not len(gaps):
+        raise InputError("fit: sample_at needs a sample behind a gap of air, got one in contact with what is there.")
+
+    def layers(slabs) -> Layers | None:
+        return Layers(*map(np.array, zip(*slabs, strict=True))) if slabs else None
+
+    # Layers of a sample go from the medium to the array.
+    behind = [*([] if sample.layers is None else sample.layers.slabs), *filters.slabs[: gaps[-1] : -1]]
+    sample = dataclasses.replace(sample, surface=imager.sample_surface, layers=layers(behind))
+    return dataclasses.replace(imager, filters=layers(filters.slabs[: gaps[-1]]), sample=sample)
+
+
+def check_fitted_sample(imager: Imager) -> None:
+    """`InputError` if a fit puts the sample's surface into the layers before it, or its index below that of air."""
+    if (sample := imager.sample) is None:
+        return
+    least = float(object_surface(imager.filters, dataclasses.replace(sample, surface=None)))
+    for name, value, lowest, unit in (
+        ("sample_at", sample.surface, least, " mm, where the layers before it end,"),
+        ("sample_index", sample.refractive_index, 1.0, ""),
+    ):
+        if value is not None and float(value) < lowest * (1 - 1e-6):
+            needs = f"{name} must be {lowest:.6g}{unit} or more"
+            raise InputError(f"captures: {needs}, got {float(value):.6g} as what fits the spots best; hold {name}.")
 
 
 def match_radius(centers: Float[Array | np.ndarray, "lens 2"]) -> float:
@@ -236,8 +291,8 @@ def core_polynomials(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Flo
     # A tilt changes the field a little, but not the lens.
     level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
     powers = (fields / imager.field_radius)[:, None] ** np.arange(1, _DEGREE + 1, 2)
-    fit = lambda one: np.linalg.lstsq(powers, core_offsets(one, depths, fields).T)[0].T
-    return np.stack([fit(one) for one in split_by_type(level, lenses_by_type(level.array))])
+    types = split_by_type(level, lenses_by_type(level.array))
+    return np.stack([np.linalg.lstsq(powers, core_offsets(imager, depths, fields).T)[0].T for imager in types])
 
 
 def core_offsets(
@@ -322,6 +377,44 @@ def residual_jacobian(unknowns: Unknowns, args: tuple[Observations, Float[Array,
     """Derivatives of all weighted residuals by all unknowns, both raveled."""
     flat, unravel = ravel_pytree(unknowns)
     return jax.jacfwd(lambda flat: ravel_pytree(weighted_residuals(unravel(flat), args))[0])(flat)
+
+
+def jackknife_errors(unknowns: Unknowns, data: Observations, lens_sd: float) -> dict[str, float]:
+    """Standard errors by name, to first order in the change by each block; 0 of lenses and where a block is decisive.
+
+    A lens that is left out itself says nothing of its own error.
+    """
+    args = data, jnp.asarray(lens_sd, data.positions.dtype)
+    jacobian = np.asarray(residual_jacobian(unknowns, args), np.float64)
+    off = np.asarray(weighted_residuals(unknowns, args)[0], np.float64)
+    lengths = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(lengths > 0, lengths, 1)
+    jacobian = jacobian / scale
+    rows, normal = jacobian[: off.size].reshape(*off.shape, -1), jacobian.T @ jacobian
+    valid = np.flatnonzero(data.valid)
+    squares = np.zeros(len(scale))
+    blocks = _blocks(np.asarray(data.imager.array.centers, np.float64), np.asarray(data.lenses)[valid])
+    for block in blocks:
+        its, residual = rows[valid[block]].reshape(-1, len(scale)), off[valid[block]].ravel()
+        others = normal - its.T @ its
+        if np.linalg.cond(others) * _SINGULAR_BLOCK > 1:
+            return dict.fromkeys(named_values(unknowns), 0.0)
+        squares += np.linalg.solve(others, its.T @ residual) ** 2
+    errors = np.sqrt(squares * (1 - 1 / len(blocks))) / scale
+    flat, unravel = ravel_pytree(unknowns)
+    return named_values(unravel(jnp.asarray(errors, flat.dtype)))
+
+
+def _blocks(centers: Float64[np.ndarray, "lens 2"], lenses: Int[np.ndarray, " spot"]) -> list[np.ndarray]:
+    """Spots of neighbouring lenses, by halving the lenses across their wider side."""
+    blocks = [np.unique(lenses)]
+    while len(blocks) < _BLOCKS and max(map(len, blocks)) > 1:
+        halves = []
+        for block in blocks:
+            across = centers[block, np.ptp(centers[block], axis=0).argmax()]
+            halves += np.array_split(block[np.argsort(across, kind="stable")], 2)
+        blocks = [half for half in halves if len(half)]
+    return [np.flatnonzero(np.isin(lenses, block)) for block in blocks]
 
 
 def check_determined(errors: dict[str, float], radius: float) -> None:

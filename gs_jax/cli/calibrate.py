@@ -77,9 +77,8 @@ def calibrate_command(
 
     from ..calibration.calibrated_design import apply_calibration, plot_residuals, summary_table
     from ..calibration.fit import PATTERN_FITTED, SELF_FITTED, calibrate, self_calibrate
-    from ..calibration.sample import OF_SAMPLE, with_surface
     from ..calibration.sources import MisfitError, Sources
-    from ..calibration.spot_model import FITTED
+    from ..calibration.spot_model import FITTED, OF_SAMPLE, with_surface
     from ..design.conversion import medium_in_words
     from ..design.design import read_design, write_design
     from ..io.files import write_figure
