@@ -111,11 +111,11 @@ class HeightMap:
             some = slice(first, min(first + size, rows))
             yield some, *self.part.surface(self.x, self.y[some])
 
-    def all(self) -> Heights:
-        """All heights, in float32."""
-        pixels = np.empty(self.shape, np.float32)
+    def pixels(self, dtype: type, unit: float) -> np.ndarray:
+        """All heights in a unit, mm, rounded if the type is of integers."""
+        pixels = np.empty(self.shape, dtype)
         for rows, height, _ in self.blocks():
-            pixels[rows] = height
+            pixels[rows] = np.rint(height / unit) if np.issubdtype(dtype, np.integer) else height / unit
         return pixels
 
     def derivatives(self, rows: slice, owner: Int[np.ndarray, "row column"]) -> Float[np.ndarray, "3 row column"]:
@@ -221,28 +221,27 @@ def write_heights(
 def _write_tiff(path: Path, heights: HeightMap, report: dict[str, Any]) -> None:
     per_cm = 10 / heights.step
     tags = {"resolution": (per_cm, per_cm), "resolutionunit": "CENTIMETER", "description": json.dumps(report)}
-    tifffile.imwrite(path, heights.all(), photometric="minisblack", metadata=None, **tags)
-
-
-def _check_tiff(path: Path, heights: HeightMap) -> Iterator[np.ndarray]:
-    pixels = tifffile.memmap(path, mode="r")
-    yield from (pixels[rows] - height for rows, height, _ in heights.blocks())
+    tifffile.imwrite(path, heights.pixels(np.float32, 1.0), photometric="minisblack", metadata=None, **tags)
 
 
 def _write_png(path: Path, heights: HeightMap, report: dict[str, Any]) -> None:
     about = PngImagePlugin.PngInfo()
     for key, value in report.items():
         about.add_text(key, json.dumps(value))
-    pixels = np.empty(heights.shape, np.uint16)
-    for rows, height, _ in heights.blocks():
-        pixels[rows] = np.rint(height / report["mm_per_count"])
-    Image.fromarray(pixels).save(path, format="PNG", pnginfo=about)
+    Image.fromarray(heights.pixels(np.uint16, report["mm_per_count"])).save(path, format="PNG", pnginfo=about)
+
+
+def _check_tiff(path: Path, heights: HeightMap) -> Iterator[np.ndarray]:
+    yield from _check_pixels(tifffile.memmap(path, mode="r"), 1.0, heights)
 
 
 def _check_png(path: Path, heights: HeightMap) -> Iterator[np.ndarray]:
     with Image.open(path, formats=["PNG"]) as image:
-        scale, pixels = json.loads(getattr(image, "text", {})["mm_per_count"]), np.asarray(image)
-    yield from (pixels[rows] * scale - height for rows, height, _ in heights.blocks())
+        yield from _check_pixels(np.asarray(image), json.loads(image.info["mm_per_count"]), heights)
+
+
+def _check_pixels(pixels: np.ndarray, unit: float, heights: HeightMap) -> Iterator[np.ndarray]:
+    yield from (pixels[rows] * unit - height for rows, height, _ in heights.blocks())
 
 
 def _write_xyz(path: Path, heights: HeightMap, _: dict[str, Any]) -> None:
@@ -288,50 +287,39 @@ def _read_lines(file, columns: int, shape: tuple[int, ...]) -> np.ndarray:
     return np.fromstring(text, sep=" ").reshape(*shape, columns).transpose(2, 0, 1)
 
 
-# Columns of the list of lenses; those of a plate are empty in lenses and the other way round.
-LENS_COLUMNS = (
-    *("object_type", "comment", "x_mm", "y_mm", "z_mm", "refractive_index", "x_half_width_mm", "y_half_width_mm"),
-    *("thickness_mm", "radius_1_mm", "conic_1", "clear_semi_diameter_1_mm", "edge_semi_diameter_1_mm"),
-    *("radius_2_mm", "conic_2", "clear_semi_diameter_2_mm", "edge_semi_diameter_2_mm"),
-)
-
-
-def lens_table(part: Part) -> tuple[list[str], list[dict[str, str | float]]]:
-    """Columns and rows of a list of objects for non-sequential ray tracing, in the frame of optical programs.
+def lens_table(part: Part) -> list[dict[str, str | float]]:
+    """A list of objects for non-sequential ray tracing, in the frame of optical programs.
 
     The first is the plate, the others are plano-convex lenses of the same material, which begin in its middle: the
     array is their union. Positions are those of front faces, radii and coefficients have the signs of OpticStudio.
     """
-    array, top, middle = part.array, part.height, part.plate_thickness / 2 + part.height
+    array, middle = part.array, part.plate_thickness / 2 + part.height
     is_front, index = array.orientation == "curved", float(array.refractive_index)
     side = 1.0 if is_front else -1.0  # of the centres of curvature, and of the plate, along z
-    rows: list[dict[str, str | float]] = [
-        {"object_type": "Rectangular Volume", "comment": "plate", "x_mm": 0.0, "y_mm": 0.0}
-        | {"z_mm": top if is_front else -part.thickness, "refractive_index": index}
-        | {"thickness_mm": part.plate_thickness}
-        | {"x_half_width_mm": part.size[0] / 2, "y_half_width_mm": part.size[1] / 2}
-    ]
-    names = [f"coefficient_r{order}_per_mm{order - 1}" for order in _orders(part.lenslets[0].terms)]
-    plane, curved = ("2", "1") if is_front else ("1", "2")
+    front = part.height if is_front else -part.thickness
+    plate = {"object_type": "Rectangular Volume", "comment": "plate", "x_mm": 0.0, "y_mm": 0.0, "z_mm": front}
+    plate |= {"refractive_index": index, "x_half_width_mm": part.size[0] / 2, "y_half_width_mm": part.size[1] / 2}
+    rows: list[dict[str, str | float]] = [plate | {"thickness_mm": part.plate_thickness}]
     for number, (lens, (x, y)) in enumerate(zip(part.lenslets, np.asarray(array.centers, float), strict=True), 1):
-        row: dict[str, str | float] = {"object_type": "Even Asphere Lens" if names else "Standard Lens"}
+        row: dict[str, str | float] = {"object_type": "Even Asphere Lens" if lens.terms else "Standard Lens"}
         row |= {"comment": f"lens {number}", "x_mm": x, "y_mm": -y, "z_mm": 0.0 if is_front else -middle}
         row |= {"refractive_index": index, "thickness_mm": middle}
-        row |= {f"radius_{plane}_mm": 0.0, f"conic_{plane}": 0.0}
-        row |= {f"radius_{curved}_mm": side * lens.radius, f"conic_{curved}": lens.conic}
-        row |= {f"{what}_semi_diameter_{face}_mm": lens.semi_aperture for what in ("clear", "edge") for face in "12"}
-        rows.append(row | dict(zip(names, (side * term for term in lens.terms), strict=True)))
-    return [*LENS_COLUMNS, *names], rows
-
-
-def _orders(terms: tuple[float, ...]) -> range:
-    return range(4, 4 + 2 * len(terms), 2)
+        for face in "12":
+            is_curved = (face == "1") == is_front
+            row |= {f"radius_{face}_mm": side * lens.radius if is_curved else 0.0}
+            row |= {f"conic_{face}": lens.conic if is_curved else 0.0}
+            row |= {f"{kind}_semi_diameter_{face}_mm": lens.semi_aperture for kind in ("clear", "edge")}
+        for order, term in enumerate(lens.terms, 2):
+            row |= {f"coefficient_r{2 * order}_per_mm{2 * order - 1}": side * term}
+        rows.append(row)
+    return rows
 
 
 def _write_lenses(path: Path, heights: HeightMap, _: dict[str, Any]) -> None:
-    columns, rows = lens_table(heights.part)
+    # A column of a plate is empty in lenses, and the other way round.
+    plate, *lenses = rows = lens_table(heights.part)
     with open(path, "w", encoding="ascii", newline="") as file:
-        table = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+        table = csv.DictWriter(file, list(plate | lenses[0]), restval="", lineterminator="\n")
         table.writeheader()
         for row in rows:
             table.writerow({key: x if isinstance(x, str) else f"{x + 0.0:.7g}" for key, x in row.items()})

@@ -10,6 +10,7 @@ from typing import Literal
 
 import manifold3d as m3
 import numpy as np
+import trimesh
 from scipy.spatial import KDTree
 
 from ..design.conversion import AIR
@@ -211,26 +212,22 @@ def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUM
 
     `expected` is its analytic volume, mm^3, and `tolerance` relative; `name` is that of the part.
     """
-    edges = np.concatenate([mesh.facets[:, [0, 1]], mesh.facets[:, [1, 2]], mesh.facets[:, [2, 0]]])
-    count = len(mesh.vertices)
-    forward, backward = np.sort(edges @ np.array([count, 1])), np.sort(edges @ np.array([1, count]))
-    watertight = bool((forward == backward).all() and (forward[1:] != forward[:-1]).all())
+    surface = trimesh.Trimesh(mesh.vertices, mesh.facets, process=False)
+    watertight = surface.is_watertight and surface.is_winding_consistent
     solid = mesh.solid()
     manifold = solid.status() == m3.Error.NoError
     bodies = len(solid.decompose()) if manifold else 0
     volume = solid.volume()
     error = float(abs(volume / expected - 1))
     size = " x ".join(f"{side:.4g}" for side in np.ptp(mesh.vertices, axis=0).tolist())
-    passed = {
+    tests = {
         "watertight": (watertight, f"every edge of the {name} has one facet on either side"),
         "manifold": (manifold, f"the {name} is a manifold ({solid.status().name})"),
         "genus": ((bodies, solid.genus()) == (1, 0), f"the {name} is one body without handles"),
         "volume": (error < tolerance, f"the {name} has {volume:.6g} mm3, {error:.1e} off the analytic volume"),
+        "size": (True, f"the {name} is {size} mm (x, y, z), of {len(mesh.facets):,} facets"),
     }
     return [
-        *(
-            CheckResult(check, "ok", f"{text}.") if ok else CheckResult(check, "error", f"not true: {text}.")
-            for check, (ok, text) in passed.items()
-        ),
-        CheckResult("size", "ok", f"the {name} is {size} mm (x, y, z), of {len(mesh.facets):,} facets."),
+        CheckResult(check, "ok" if passed else "error", f"{'' if passed else 'not true: '}{text}.")
+        for check, (passed, text) in tests.items()
     ]
