@@ -23,13 +23,13 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gs_jax import Imager, Sensor
+from gs_jax.apps.pictures import PALETTE
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.lenses import EACH
-from gs_jax.pictures import PALETTE
 
 # Designs that only experiments use.
 DESIGNS = Path(__file__).parent / "designs"

@@ -28,8 +28,7 @@ from gs_jax.apps.method_benchmark import timed
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.projection.measured_psf import ConvolutionOperator
-from gs_jax.solvers.admm import ConvolutionADMM
-from gs_jax.solvers.admm import total_variation
+from gs_jax.solvers.admm import ConvolutionADMM, total_variation
 from gs_jax.solvers.base import differences, solve
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy

@@ -22,13 +22,13 @@ from experiments.point_density import scene
 from experiments.profiles import local_maxima
 from gs_jax import Grid
 from gs_jax.apps.method_benchmark import timed
+from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
-from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize
 

@@ -24,10 +24,10 @@ from experiments.common import Report, main, table
 from experiments.ray_tracer import traced
 from experiments.true_image import bars
 from gs_jax import Grid
+from gs_jax.apps.pictures import draw_image
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.design.start import geomscope
-from gs_jax.pictures import draw_image
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.synthetic import Camera, electrons, expose
 

@@ -21,11 +21,11 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of
 from experiments.phantoms import beads
 from experiments.point_density import scores
 from gs_jax import Grid
+from gs_jax.apps.pictures import draw_image
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
-from gs_jax.pictures import draw_image
 from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 
 # mm: depths and sides of the slab, and spacing of emitters in a ball of 5 um.

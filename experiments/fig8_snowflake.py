@@ -29,12 +29,12 @@ from experiments.phantoms import snowflake
 from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
 from gs_jax.apps.example_pipeline import words
+from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
-from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize
 from gs_jax.simulation.synthetic import Camera, electrons, expose, simulate_points

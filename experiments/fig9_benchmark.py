@@ -36,6 +36,7 @@ from experiments.true_image import DEVICES, bars, strokes
 from gs_jax import Grid, Imager, Surface, Unrolled, forward_residual
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import render_points, timed
+from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
@@ -45,7 +46,6 @@ from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.theory import FWHM
-from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.networks import read_unrolled
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, reconstruct, voxel_grid
 from gs_jax.simulation.phantoms import letters, rasterize

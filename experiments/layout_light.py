@@ -28,7 +28,7 @@ from gs_jax import (
     reconstruct,
 )
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.simulated_captures import (
+from gs_jax.apps.training_data import (
     FIELD_RADIUS,
     SCENE_PLANES,
     CaptureSpec,

@@ -28,8 +28,8 @@ import numpy as np
 from experiments.common import Report, main, table
 from gs_jax import Unrolled, psf_model, quality, reconstruct, suppress
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.simulated_captures import CaptureSpec, Example, simulate_example
-from gs_jax.apps.training.training_loop import UNROLLED
+from gs_jax.apps.training import UNROLLED
+from gs_jax.apps.training_data import CaptureSpec, Example, simulate_example
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import pretrained

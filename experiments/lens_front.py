@@ -24,6 +24,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from experiments.common import DESIGNS, Report, design_file, main, table
 from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.pictures import PALETTE
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.pareto import sweep_of
@@ -31,7 +32,6 @@ from gs_jax.codesign.study import Study, initial_design, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.conversion import reduced_depth
 from gs_jax.design.design import Design, read_design
-from gs_jax.pictures import PALETTE
 
 SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))
 # Shares of the light of a point 20.5 mm away, %, and their tolerance.

@@ -25,7 +25,7 @@ from experiments.common import OPTIONAL_PATH, Report, main, table
 from experiments.surfaces import DEPTHS, PITCH, STEP, VOXEL, Emitters, capture, device, gain, noisy
 from gs_jax import Grid, Imager, Unrolled, rasterize, read_capture, read_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.from_captures import fine_tune
+from gs_jax.apps.fine_tuning import fine_tune
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
 from gs_jax.reconstruction.radius_fit import RadiusFit, fit_radius, with_radii

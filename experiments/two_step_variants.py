@@ -27,16 +27,16 @@ from experiments.common import Report, main, table
 from experiments.learned import interval
 from gs_jax import backproject, quality
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.simulated_captures import CaptureSpec, simulate_example
-from gs_jax.apps.training.training_loop import Recipe, init, slices_loss, train
-from gs_jax.apps.training.training_slices import PLANES, Batch
+from gs_jax.apps.training import Recipe, init, slices_loss, train
+from gs_jax.apps.training_data import CaptureSpec, simulate_example
+from gs_jax.apps.training_slices import PLANES, Batch
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import UNet, multislice_network, standardize
 from gs_jax.optics.psf_core import core_distortion
 
 SPEC = CaptureSpec(640, 0.009, 0.04, PLANES)
 SIZE, COUNT = 96, 8
-# As in `gs_jax.apps.training.training_slices`: smallest norm to which errors are relative.
+# As in `gs_jax.apps.training_slices`: smallest norm to which errors are relative.
 _GHOSTS, _LEAST_ENERGY = 0.05, 1e-3
 
 

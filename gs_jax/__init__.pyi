@@ -1,5 +1,6 @@
 from . import objectives as objectives
 from ._version import __version__ as __version__
+from .apps.pictures import show as show
 from .base.errors import InputError as InputError
 from .base.progress import Progress as Progress
 from .calibration.fit import calibrate as calibrate
@@ -22,7 +23,6 @@ from .lenses import MicrolensArray as MicrolensArray
 from .materials import EmissionBand as EmissionBand, refractive_index as refractive_index
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
-from .pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward, psf_model as psf_model
 from .projection.measured_psf import ConvolutionOperator as ConvolutionOperator

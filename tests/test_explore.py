@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, backproject, read_design
-from gs_jax.apps.explore import evaluation, preview
-from gs_jax.apps.explore.evaluation import complete_values, evaluate_design, make_sliders, start_of
-from gs_jax.apps.explore.server import Server, Session
+from gs_jax.apps import explore_design as evaluation, explore_preview as preview
+from gs_jax.apps.explore import Server, Session
+from gs_jax.apps.explore_design import complete_values, evaluate_design, make_sliders, start_of
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS

@@ -19,7 +19,6 @@ ORDER = [
     "grid",
     "geometry",
     "metrics",
-    "pictures",
     "layouts",
     "optics",
     "objectives",

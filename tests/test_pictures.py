@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, show
-from gs_jax.pictures import make_slices
+from gs_jax.apps.pictures import make_slices
 
 
 @pytest.mark.parametrize("depths", [[20.0], [18.0, 19.0, 22.0]])

@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.__main__ import main
-from gs_jax.apps.report import drawings, report_tables, report_tables as views
-from gs_jax.apps.report.drawings import line_chart
-from gs_jax.apps.report.page import write_report
+from gs_jax.apps import drawings, report_tables, report_tables as views
+from gs_jax.apps.drawings import line_chart
+from gs_jax.apps.pictures import downsample, make_slices
+from gs_jax.apps.report import write_report
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import search_report
 from gs_jax.design.design import read_design
@@ -25,7 +26,6 @@ from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_surface, write_volume
 from gs_jax.layouts import plate_corners
 from gs_jax.optics.raytrace import trace_lenslet
-from gs_jax.pictures import downsample, make_slices
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run

@@ -6,7 +6,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from gs_jax.pictures import PALETTE, draw_image, label_of, line_of
+from gs_jax.apps.pictures import PALETTE, draw_image, label_of, line_of
 
 METHODS = ["backproject", "backproject + cluster", "backproject + unet", "unrolled", "list-rl", "fista", "admm"]
 

@@ -27,7 +27,7 @@ from gs_jax.apps.device_model import (
     standard_deviations,
     step_squares,
 )
-from gs_jax.apps.report.report_tables import tolerance_table
+from gs_jax.apps.report_tables import tolerance_table
 from gs_jax.apps.tolerance_analysis import Outcome, combine_changes, make_problem, measure_devices, tolerance
 from gs_jax.apps.tolerance_report import as_json, picture, rank_tolerances, sentences, summarise_changes
 from gs_jax.apps.tolerance_spec import ToleranceSpec, read_tolerances

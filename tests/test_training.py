@@ -6,10 +6,10 @@ import optax
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.apps.training import simulated_captures, training_slices
-from gs_jax.apps.training.simulated_captures import CaptureSpec
-from gs_jax.apps.training.training_loop import Recipe, init, read_checkpoint, slices_loss, train, write_checkpoint
-from gs_jax.apps.training.training_slices import (
+from gs_jax.apps import training_data as simulated_captures, training_slices
+from gs_jax.apps.training import Recipe, init, read_checkpoint, slices_loss, train, write_checkpoint
+from gs_jax.apps.training_data import CaptureSpec
+from gs_jax.apps.training_slices import (
     SPECS,
     Stack,
     _path,
@@ -188,7 +188,7 @@ def test_stacks_of_other_specs_are_not_read(tmp_path, monkeypatch):
 @pytest.fixture
 def toy_command(monkeypatch):
     module = sys.modules["gs_jax.cli.train"]
-    monkeypatch.setattr("gs_jax.apps.training.training_loop.paper_recipe", toy)
+    monkeypatch.setattr("gs_jax.apps.training.paper_recipe", toy)
     monkeypatch.setattr(module, "_EVERY", 2)
 
     def invoke(*arguments):
@@ -231,7 +231,7 @@ def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, mon
         return sample_paper_batch(rng, 16)
 
     with monkeypatch.context() as patched:
-        patched.setattr(sys.modules["gs_jax.apps.training.training_loop"], "paper_recipe", lambda: toy(batch=batch))
+        patched.setattr(sys.modules["gs_jax.apps.training"], "paper_recipe", lambda: toy(batch=batch))
         assert toy_command("--steps", 5, "-o", broken).exit_code == 1
     assert not broken.exists() and side_file(broken, ".checkpoint").exists()
     assert toy_command("--steps", 5, "--resume", "-o", broken).exit_code == 0

@@ -13,8 +13,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
-from gs_jax.apps.training.simulated_captures import SCENES, CaptureSpec, random_microscope, simulate_example
-from gs_jax.apps.training.training_loop import (
+from gs_jax.apps.training import (
     UNROLLED,
     UnrolledExample,
     init,
@@ -24,6 +23,7 @@ from gs_jax.apps.training.training_loop import (
     unrolled_recipe,
     with_fixed_steps,
 )
+from gs_jax.apps.training_data import SCENES, CaptureSpec, random_microscope, simulate_example
 from gs_jax.base.progress import Progress
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.inverse_problem import InverseProblem, LensTypeGeometry

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from ..base.machine import describe
 from ..io.files import atomic_write, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
-from ..pictures import line_of
 from .method_benchmark import STEPS
+from .pictures import line_of
 
 COLUMNS = (
     *("method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed"),

@@ -34,7 +34,7 @@ from ..simulation.phantoms import letters, random_points, rasterize
 from ..simulation.synthetic import Camera, expose, simulate
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..typing import PathLike
-from .report.page import write_report
+from .report import write_report
 
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
 _DEPTHS = np.arange(17.0, 23.01, 0.5)
@@ -101,7 +101,7 @@ def run(folder: PathLike, progress: Progress | None = None) -> Path:
 
 
 def _template(name: str) -> str:
-    return (resources.files("gs_jax") / "apps" / name).read_text("utf-8")
+    return (resources.files("gs_jax") / "apps" / "templates" / name).read_text("utf-8")
 
 
 def _optimise(folder: Path, progress: Progress) -> list[dict]:

@@ -42,8 +42,8 @@ def report_command(
         capture: CAPTURE.tif: the capture of VOLUME.
         tolerance: TOLERANCE.json of `gs-jax tolerance -o`.
     """
-    from ..apps.report.page import write_report
-    from ..apps.report.report_tables import read_tolerance
+    from ..apps.report import write_report
+    from ..apps.report_tables import read_tolerance
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
     from ..io.volumes import read_surface, read_volume
@@ -105,7 +105,7 @@ def explore_command(
     """
     import webbrowser
 
-    from ..apps.explore.server import Server, Session
+    from ..apps.explore import Server, Session
     from ..codesign.study import read_study
     from ..codesign.terms import add_terms
 

@@ -109,7 +109,7 @@ def train_command(
         )
     import numpy as np
 
-    from ..apps.training.training_loop import (
+    from ..apps.training import (
         init,
         multislice_recipe,
         paper_recipe,
@@ -120,7 +120,7 @@ def train_command(
         with_fixed_steps,
         write_checkpoint,
     )
-    from ..apps.training.training_slices import simulate_stacks
+    from ..apps.training_slices import simulate_stacks
     from ..detection.unet import write_weights
     from ..reconstruction.networks import write_unrolled
 
@@ -170,7 +170,7 @@ def _from_captures(
 ) -> None:
     import numpy as np
 
-    from ..apps.training.from_captures import check_number, fine_tune
+    from ..apps.fine_tuning import check_number, fine_tune
     from ..design.design import write_design
     from ..geometry import check_beyond
     from ..io.recordings import capture_files

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import color_sequences
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
@@ -19,12 +20,14 @@ from ..io.provenance import Provenance
 from ..layouts import plate_corners
 from ..lenses import lenses_by_type
 from ..optics.raytrace import to_numpy
-from ..pictures import PALETTE
 from ..typing import PathLike
 from .parameters import significant
 from .search import Outcome
 from .study import Row, TermTable, labels
 from .terms import SIGNS, TERMS, unit_of
+
+# As `gs_jax.apps.pictures`.
+PALETTE = color_sequences["petroff10"]
 
 
 def before_and_after(outcome: Outcome) -> Table:

@@ -17,24 +17,24 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Float32
 
-from ...base.arrays import divide
-from ...base.errors import InputError
-from ...base.progress import Progress
-from ...geometry import Imager
-from ...grid import Grid
-from ...projection.forward_model import Optics
-from ...projection.operators import ImagingOperator
-from ...reconstruction.inverse_problem import (
+from ..base.arrays import divide
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..geometry import Imager
+from ..grid import Grid
+from ..projection.forward_model import Optics
+from ..projection.operators import ImagingOperator
+from ..reconstruction.inverse_problem import (
     InverseProblem,
     lens_type_geometries,
     prepare_data,
     prepare_model,
 )
-from ...reconstruction.residual import kept_pixels_of_folds
-from ...solvers.base import run_solver
-from ...solvers.unrolled import State as UnrolledState, Unrolled
-from ...typing import Image
-from .training_loop import Recipe, State, init, run_fixed_steps, train, unroll
+from ..reconstruction.residual import kept_pixels_of_folds
+from ..solvers.base import run_solver
+from ..solvers.unrolled import State as UnrolledState, Unrolled
+from ..typing import Image
+from .training import Recipe, State, init, run_fixed_steps, train, unroll
 
 # Captures at the least, and the share of them that is held out.
 _LEAST, _HELD_OUT = 3, 4

@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Num, Shaped, UInt8
-from matplotlib import colormaps
+from matplotlib import color_sequences, colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
-from .base.arrays import host_code
-from .grid import Grid
-from .typing import Points
+from ..base.arrays import host_code
+from ..grid import Grid
+from ..typing import Points
 
 # Told apart with any colour vision (M. A. Petroff, arXiv:2107.02270).
-PALETTE = ("#3f90da", "#ffa90e", "#bd1f01", "#94a4a2", "#832db6", "#a96b59", "#e76300", "#b9ac70", "#717581", "#92dadd")
+PALETTE = color_sequences["petroff10"]
 # What a method is called in a picture, its colour and its marker.
 _METHODS = {
     "zeros": ("nothing", "black", ""),

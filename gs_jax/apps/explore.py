@@ -18,13 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ...base.errors import InputError, needs_extra
-from ...codesign.study import Study
-from ...design.design import Design, write_design
-from ...pictures import png_uri, to_uint8
-from ..report.drawings import draw_layout, line_chart
-from ..report.page import render
-from .evaluation import (
+from ..base.errors import InputError, needs_extra
+from ..codesign.study import Study
+from ..design.design import Design, write_design
+from .drawings import draw_layout, line_chart
+from .explore_design import (
     SPOT_DEPTHS,
     SPOT_FIELDS,
     Evaluation,
@@ -38,7 +36,9 @@ from .evaluation import (
     moved_imager,
     start_of,
 )
-from .preview import map_ghosts, reconstruct_points
+from .explore_preview import map_ghosts, reconstruct_points
+from .pictures import png_uri, to_uint8
+from .report import render
 
 HOST = "127.0.0.1"
 # Of a request's body, bytes: seven numbers with their names.
@@ -85,7 +85,7 @@ class Session:
         self.kept: list[tuple[str, Values, Evaluation]] = []
         environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
         environment.filters["number"] = lambda value: f"{value:.4g}" if np.isfinite(value) else "-"
-        text = (resources.files("gs_jax") / "apps" / "explore" / "parts.html").read_text("utf-8")
+        text = (resources.files("gs_jax") / "apps" / "templates" / "parts.html").read_text("utf-8")
         self.html: Any = environment.from_string(text).module
         self.keep({}, "start")
 
@@ -93,7 +93,7 @@ class Session:
         """The page, as HTML."""
         late = [table.name for table in (self.study.terms if self.study else ()) if table.name not in self.terms]
         context = {"design": self.design, "sliders": self.sliders, "token": token, "late": late}
-        return render("explore.html", context, folder="explore")
+        return render("explore.html", context)
 
     def move(self, values: Values) -> dict[str, Any]:
         """Evaluate the design of these values: parts of the page by name, and the time that it took."""

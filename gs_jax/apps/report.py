@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Num
 
-from ...base.errors import InputError, needs_extra
-from ...base.progress import Progress
-from ...design.datasheets import datasheet, findings
-from ...design.design import Design, design_text
-from ...geometry import Imager
-from ...grid import Grid
-from ...io.files import check_output, write_text
-from ...io.provenance import Provenance
-from ...io.volumes import SurfaceMaps, surface_mesh
-from ...optics.raytrace import to_numpy
-from ...pictures import color_table, make_slices, png_uri, scale_bar_html, slider_html, to_base64, to_uint8
-from ...typing import Image, PathLike, Points
+from ..base.errors import InputError, needs_extra
+from ..base.progress import Progress
+from ..design.datasheets import datasheet, findings
+from ..design.design import Design, design_text
+from ..geometry import Imager
+from ..grid import Grid
+from ..io.files import check_output, write_text
+from ..io.provenance import Provenance
+from ..io.volumes import SurfaceMaps, surface_mesh
+from ..optics.raytrace import to_numpy
+from ..typing import Image, PathLike, Points
 from . import report_tables as tables
 from .drawings import Psfs, count_lenses, draw_layout, draw_section, ideal_mtf, line_chart, mtf, simulate_psfs
+from .pictures import color_table, make_slices, png_uri, scale_bar_html, slider_html, to_base64, to_uint8
 
 PAPER = {
     "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
@@ -136,18 +136,18 @@ def write_report(
     write_text(path, render("report.html", context), [".html"])
 
 
-def render(name: str, context: Mapping[str, Any], folder: str = "report") -> str:
-    """Renders a template in a folder of `gs_jax/apps` with the style sheet of the report and its own script."""
+def render(name: str, context: Mapping[str, Any]) -> str:
+    """Render a template of `gs_jax/apps/templates` with the style sheet of the report and its own script."""
     with needs_extra("report"):
         import jinja2
 
-    read = lambda *parts: resources.files("gs_jax").joinpath("apps", *parts).read_text("utf-8")
+    read = lambda name: resources.files("gs_jax").joinpath("apps", "templates", name).read_text("utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    embedded = {"style": read("report", "page.css"), "script": read(folder, name.replace(".html", ".js"))}
-    return environment.from_string(read(folder, name)).render({**embedded, **context})
+    embedded = {"style": read("page.css"), "script": read(name.replace(".html", ".js"))}
+    return environment.from_string(read(name)).render({**embedded, **context})
 
 
 def _origins(design: Design, provenance: Provenance | None, origins: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Float16, Float32
 from scipy.ndimage import gaussian_filter
 
-from ...base.caches import digest_of
-from ...base.progress import Progress
-from ...base.workers import Workers
-from ...detection.unet import standardize
-from ...io.files import atomic_write, decoding, make_folder
-from ...optics.psf_core import core_distortion
-from ...projection.backprojection import backproject
-from ...typing import PathLike
-from .simulated_captures import SCENES, CaptureSpec, draw_objects, simulate_example
+from ..base.caches import digest_of
+from ..base.progress import Progress
+from ..base.workers import Workers
+from ..detection.unet import standardize
+from ..io.files import atomic_write, decoding, make_folder
+from ..optics.psf_core import core_distortion
+from ..projection.backprojection import backproject
+from ..typing import PathLike
+from .training_data import SCENES, CaptureSpec, draw_objects, simulate_example
 
 # The paper's training sets: slices, and per slice of distance the blur (voxels) and the factor of others' light; noise.
 # The ten and the 5 % are the paper's; the rest is ours, as its supplement is not available.

@@ -11,19 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ... import objectives
-from ...base.errors import InputError
-from ...codesign.parameters import candidate, depths_between, evaluated, start_values
-from ...codesign.study import Study
-from ...codesign.terms import SIGNS, TERMS, evaluate as evaluate_term
-from ...design.conversion import object_begins
-from ...design.datasheets import SIZES, circle_of_confusion_of, columns_of
-from ...design.design import Design
-from ...geometry import Imager
-from ...lenses import lenses_by_type
-from ...objectives.conditions import Conditions, per_type
-from ...optics.psf import least_samples, spot_image
-from ...optics.raytrace import to_numpy
+from .. import objectives
+from ..base.errors import InputError
+from ..codesign.parameters import candidate, depths_between, evaluated, start_values
+from ..codesign.study import Study
+from ..codesign.terms import SIGNS, TERMS, evaluate as evaluate_term
+from ..design.conversion import object_begins
+from ..design.datasheets import SIZES, circle_of_confusion_of, columns_of
+from ..design.design import Design
+from ..geometry import Imager
+from ..lenses import lenses_by_type
+from ..objectives.conditions import Conditions, per_type
+from ..optics.psf import least_samples, spot_image
+from ..optics.raytrace import to_numpy
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
 _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)

@@ -15,17 +15,17 @@ from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
-from ...base.arrays import to_float32
-from ...geometry import Imager
-from ...grid import Grid, Sensor
-from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
-from ...lenses import MicrolensArray
-from ...optics.field_varying import FieldVaryingPsf, field_varying_psf
-from ...optics.polar_grid import PolarGrid, make_polar_grid
-from ...optics.psf_core import RINGS
-from ...projection.forward_model import forward
-from ...simulation.synthetic import Camera, electrons, expose
-from ...typing import Volume
+from ..base.arrays import to_float32
+from ..geometry import Imager
+from ..grid import Grid, Sensor
+from ..layouts import hexagonal_layout, poisson_disc_layout, random_layout
+from ..lenses import MicrolensArray
+from ..optics.field_varying import FieldVaryingPsf, field_varying_psf
+from ..optics.polar_grid import PolarGrid, make_polar_grid
+from ..optics.psf_core import RINGS
+from ..projection.forward_model import forward
+from ..simulation.synthetic import Camera, electrons, expose
+from ..typing import Volume
 
 # Planes of a scene; scenes per microscope, whose tables take longer than an image.
 SCENE_PLANES, SCENES = 6, 8

@@ -13,16 +13,16 @@ import optax
 from jax import lax
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
-from ...base.errors import InputError
-from ...base.progress import Progress
-from ...base.workers import Workers
-from ...detection.unet import UNet, multislice_network, paper_network
-from ...io.files import atomic_write, check_input, decoding
-from ...reconstruction.inverse_problem import InverseProblem, lens_type_geometries, subtract_offset
-from ...solvers.base import Operator
-from ...solvers.unrolled import State as UnrolledState, Unrolled, initialize_unrolled
-from ...typing import PathLike, Volume
-from .simulated_captures import SCENES, CaptureSpec, simulate_example, trace_optics
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..base.workers import Workers
+from ..detection.unet import UNet, multislice_network, paper_network
+from ..io.files import atomic_write, check_input, decoding
+from ..reconstruction.inverse_problem import InverseProblem, lens_type_geometries, subtract_offset
+from ..solvers.base import Operator
+from ..solvers.unrolled import State as UnrolledState, Unrolled, initialize_unrolled
+from ..typing import PathLike, Volume
+from .training_data import SCENES, CaptureSpec, simulate_example, trace_optics
 from .training_slices import Batch, Stack, sample_paper_batch, sample_patches
 
 # Captures of the unrolled networks: pixels are sums of 4 x 4, voxels as wide as those by default.

@@ -9,18 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Num
 
-from ...base.errors import InputError
-from ...base.machine import describe
-from ...design.conversion import NO_SAMPLE, default_sample, object_begins
-from ...design.datasheets import circle_of_confusion_of
-from ...design.design import Design, span_of
-from ...grid import Grid
-from ...io.files import read_text
-from ...lenses import MicrolensArray
-from ...mold.lenslets import Part
-from ...mold.solids import MoldShape, preview_solid
-from ...pictures import block_maxima, display_range, downsample, png_uri, shade, to_base64, to_uint8
-from ...typing import PathLike
+from ..base.errors import InputError
+from ..base.machine import describe
+from ..design.conversion import NO_SAMPLE, default_sample, object_begins
+from ..design.datasheets import circle_of_confusion_of
+from ..design.design import Design, span_of
+from ..grid import Grid
+from ..io.files import read_text
+from ..lenses import MicrolensArray
+from ..mold.lenslets import Part
+from ..mold.solids import MoldShape, preview_solid
+from ..typing import PathLike
+from .pictures import block_maxima, display_range, downsample, png_uri, shade, to_base64, to_uint8
 
 # Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.datasheets`.
 _FAR = 2.0

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.signal import fftconvolve
 
-from ...geometry import Imager, envelope
-from ...grid import Grid, Sensor
-from ...optics.psf import spot_image
-from ...optics.raytrace import to_numpy
-from ...simulation.phantoms import random_points
-from ..report.drawings import plate_and_sensor
-from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples
+from ..geometry import Imager, envelope
+from ..grid import Grid, Sensor
+from ..optics.psf import spot_image
+from ..optics.raytrace import to_numpy
+from ..simulation.phantoms import random_points
+from .drawings import plate_and_sensor
+from .explore_design import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples
 
 # Cells across the map of ghosts, and its depths.
 _CELLS, _GHOST_DEPTHS = 141, 9

@@ -15,17 +15,17 @@ from jaxtyping import Float, Int
 from matplotlib.path import Path as MatplotlibPath
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from ...base.errors import needs_extra
-from ...design.conversion import default_sample
-from ...design.design import Design
-from ...geometry import Imager
-from ...layers import layers_in_front
-from ...layouts import cell_edges, on_sensor, plate_corners
-from ...mold.lenslets import Part
-from ...optics import theory
-from ...optics.psf import least_samples, spot_image
-from ...optics.raytrace import to_numpy
-from ...pictures import round_length
+from ..base.errors import needs_extra
+from ..design.conversion import default_sample
+from ..design.design import Design
+from ..geometry import Imager
+from ..layers import layers_in_front
+from ..layouts import cell_edges, on_sensor, plate_corners
+from ..mold.lenslets import Part
+from ..optics import theory
+from ..optics.psf import least_samples, spot_image
+from ..optics.raytrace import to_numpy
+from .pictures import round_length
 
 # Left, right, top and bottom of a chart's axes in its 440 x 290 pixels, and line styles to tell lines without colours.
 _FRAME, _DASHES = (56, 428, 12, 246), ("", "7 4", "2 3", "9 3 2 3", "4 4", "1 4", "12 4")
@@ -48,7 +48,7 @@ def _macros() -> Any:
     with needs_extra("report"):
         import jinja2
 
-    text = (resources.files("gs_jax") / "apps" / "report" / "drawings.html").read_text("utf-8")
+    text = (resources.files("gs_jax") / "apps" / "templates" / "drawings.html").read_text("utf-8")
     return (
         jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(text).module
     )
