@@ -22,7 +22,7 @@ from experiments.design_judge import diffracted
 from experiments.ray_tracer import can_trace, traced
 from gs_jax import Design, Grid, InputError
 from gs_jax.apps.report import write_report
-from gs_jax.apps.tolerance_analysis import tolerance
+from gs_jax.apps.tolerances import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import PATTERN_FITTED

@@ -21,6 +21,8 @@ from gs_jax.apps.device_model import (
     depth_errors,
     lens_squares,
     log_sharpness,
+    make_problem,
+    measure_devices,
     no_errors,
     perturb,
     sample_errors,
@@ -28,9 +30,17 @@ from gs_jax.apps.device_model import (
     step_squares,
 )
 from gs_jax.apps.report_tables import tolerance_table
-from gs_jax.apps.tolerance_analysis import Outcome, combine_changes, make_problem, measure_devices, tolerance
-from gs_jax.apps.tolerance_report import as_json, picture, rank_tolerances, sentences, summarise_changes
 from gs_jax.apps.tolerance_spec import ToleranceSpec, read_tolerances
+from gs_jax.apps.tolerances import (
+    Outcome,
+    as_json,
+    combine_changes,
+    picture,
+    rank_tolerances,
+    sentences,
+    summarise_changes,
+    tolerance,
+)
 from gs_jax.cli.fabrication import tolerance_command as command
 from gs_jax.geometry import envelope
 from gs_jax.objectives import Conditions

@@ -36,6 +36,8 @@ from ..calibration.spot_model import (
     residuals,
     trace_core_offsets,
 )
+from ..design.datasheets import parts_of
+from ..design.design import Design
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..objectives.conditions import Conditions, clear_diameter
@@ -67,6 +69,8 @@ _MIN_LENSES, _ROUNDED = 2, 8
 _STEPS = {"radius": 0.01, "conic": 0.05, "index": 0.005}
 # Depths at which cores are traced; interpolation has kinks there, which few asked depths meet.
 _CORE_DEPTHS = 4
+# Devices per compiled call, whose rays are in memory at once.
+BATCH = 8
 # Gauss-Newton steps: lens position errors leave a residual, which each step makes a few times smaller.
 _ITERATIONS = 10
 
@@ -326,3 +330,66 @@ def _least_squares(residual: Callable[[Unknowns], Array], start: Unknowns) -> Un
         return state - scale * solve_triangular(r, q.T @ flat(state))
 
     return unravel(jax.lax.fori_loop(0, _ITERATIONS, step, state))
+
+
+class Measures(NamedTuple):
+    """Logarithms of the spot width, mm, and of the Strehl ratio, and depth errors, mm, of devices.
+
+    Depth errors are with the geometry of the `designed` and of the `calibrated` device.
+    """
+
+    log_width: Float[Array | np.ndarray, "*device depth"]
+    log_strehl: Float[Array | np.ndarray, "*device depth"]
+    designed: Float[Array | np.ndarray, "*device point"]
+    calibrated: Float[Array | np.ndarray, "*device point"]
+
+
+class Problem(NamedTuple):
+    """The lenses of each type and their conditions, the arguments of `depth_errors`, and the printer's pixel, mm."""
+
+    parts: tuple[tuple[Imager, Conditions], ...]
+    depth_arguments: tuple[Imager, CoreModel, VisiblePoints, VisiblePoints]
+    pixel: Float[Array, ""]
+
+    @property
+    def lenses(self) -> int:
+        """Number of lenses."""
+        return len(self.depth_arguments[0].array.centers)
+
+
+def make_problem(
+    design: Design,
+    depths: Float64[np.ndarray, " depth"],
+    sources: Float64[np.ndarray, "source 3"] | None = None,
+    pixel: float = 0.005,
+) -> Problem:
+    """The problem of a design at some depths, mm."""
+    # Each device has clear apertures of its own.
+    parts = tuple((imager, dataclasses.replace(at, clear_diameter=None)) for imager, at in parts_of(design, depths))
+    return Problem(parts, depth_arguments(design.imager(), depths, sources), jnp.asarray(pixel))
+
+
+def measure_devices(problem: Problem, errors: Errors, advance=lambda: None) -> Measures:
+    """Measure devices, in batches of one size for any number of them, so that one program is compiled."""
+    batches, count = [], len(errors.radius)
+    for start in range(0, count, BATCH):
+        index = np.minimum(np.arange(start, start + BATCH), count - 1)
+        batch = _measure(problem, jax.tree.map(lambda error, index=index: error[index], errors))
+        batches.append(Measures(*(np.asarray(values, np.float64)[: count - start] for values in batch)))
+        advance()
+    return Measures(*map(np.concatenate, zip(*batches, strict=True)))
+
+
+@eqx.filter_jit
+def _measure(problem: Problem, errors: Errors) -> Measures:
+    def measure(device: Errors) -> Measures:
+        return Measures(*sharpness(problem, device), *depth_errors(*problem.depth_arguments, device))
+
+    return jax.vmap(measure)(errors)
+
+
+def sharpness(problem: Problem, errors: Errors) -> tuple[Float[Array, " depth"], Float[Array, " depth"]]:
+    """`log_sharpness` of the lens type that is best at each depth."""
+    by_type = [log_sharpness(*lens_type, errors, problem.pixel) for lens_type in problem.parts]
+    widths, ratios = map(jnp.stack, zip(*by_type, strict=True))
+    return jnp.min(widths, 0), jnp.max(ratios, 0)

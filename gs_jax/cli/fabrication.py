@@ -185,9 +185,8 @@ def tolerance_command(
     import numpy as np
     from rich.console import Console
 
-    from ..apps.tolerance_analysis import tolerance
-    from ..apps.tolerance_report import as_json, picture, sentences, tables
     from ..apps.tolerance_spec import read_tolerances
+    from ..apps.tolerances import as_json, picture, sentences, tables, tolerance
     from ..geometry import check_beyond
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
