@@ -13,7 +13,7 @@ import gs_jax as gs
 from gs_jax import InputError, objectives
 from gs_jax.apps.drawings import draw_section
 from gs_jax.apps.explore_design import make_sliders
-from gs_jax.apps.report_tables import device_rows
+from gs_jax.apps.report import device_rows
 from gs_jax.apps.tolerances import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.linear_error import lens_electrons, lost_power

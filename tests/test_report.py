@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.__main__ import main
-from gs_jax.apps import drawings, report_tables, report_tables as views
+from gs_jax.apps import drawings
 from gs_jax.apps.drawings import line_chart
 from gs_jax.apps.pictures import downsample, make_slices
-from gs_jax.apps.report import write_report
+from gs_jax.apps.report import SLICE_BYTES, strip_folders, tolerance_section, voxel_view, write_report
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import search_report
 from gs_jax.design.design import read_design
@@ -209,7 +209,7 @@ def test_wrong_input_is_one_line(made, tmp_path, monkeypatch, capsys, arguments,
 
 def test_tolerances_of_another_kind_are_refused():
     with pytest.raises(InputError, match="gs-jax tolerance"):
-        report_tables.tolerance_table(TOLERANCE | {"drawn": {}})
+        tolerance_section(TOLERANCE | {"drawn": {}})
 
 
 @pytest.mark.parametrize(
@@ -223,20 +223,19 @@ def test_tolerances_of_another_kind_are_refused():
     ],
 )
 def test_folders_are_left_out(text, kept):
-    assert report_tables.strip_folders(text) == kept
+    assert strip_folders(text) == kept
 
 
 def test_the_largest_volumes_stay_small():
     """Noise, which nothing compresses, with as many bytes as slices may have; and a view in space."""
-    side = int(np.sqrt(views.SLICE_BYTES / 100))
+    side = int(np.sqrt(SLICE_BYTES / 100))
     for shape in ((100, side, side), (3, 1500, 1400)):
         volume = np.random.default_rng(0).random(shape, np.float32)
         grid = Grid(np.linspace(18, 22, shape[0]), shape[1:], 0.01)
-        shown = make_slices(volume, grid, views.SLICE_BYTES)
-        drawn = [p.picture for p in views.make_projections(volume, grid)]
-        cloud = views.voxel_view(volume, grid)
+        shown = make_slices(volume, grid, SLICE_BYTES)
+        cloud = voxel_view(volume, grid)
         assert cloud["count"] <= 60_000 and len(shown.pictures) == shape[0]
-        assert sum(map(len, [*shown.pictures, *drawn, cloud["voxels"]])) < 11e6
+        assert sum(map(len, [*shown.pictures, cloud["voxels"]])) < 11e6
 
 
 def test_the_cloud_is_where_the_voxels_are():
@@ -244,7 +243,7 @@ def test_the_cloud_is_where_the_voxels_are():
     grid = Grid(np.linspace(18, 22, 7), (501, 401), 0.02, (1.0, -2.0))
     volume = np.zeros(grid.volume_shape, np.float32)
     volume[4, 300, 123] = 1
-    cloud = views.voxel_view(volume, grid)
+    cloud = voxel_view(volume, grid)
     x, y, z, value = np.frombuffer(base64.b64decode(cloud["voxels"]), np.uint8)
     assert cloud["count"] == 1 and value == 255
     place = [cloud["first"][0] + x * cloud["pitch"][0], cloud["first"][1] + y * cloud["pitch"][1], cloud["depths"][z]]

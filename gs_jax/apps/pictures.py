@@ -1,11 +1,11 @@
 """Pictures: one style for all, maximum projections to scale, and slices with a slider as HTML without scripts.
 
-A method has a colour and a marker, and images say how long and how bright they are.
+A method has a colour and a marker, and images have a scale bar and a scale of brightness.
 """
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from ..typing import Points
 
 # Told apart with any colour vision (M. A. Petroff, arXiv:2107.02270).
 PALETTE = color_sequences["petroff10"]
-# What a method is called in a picture, its colour and its marker.
+# Label, colour and marker of methods in pictures.
 _METHODS = {
     "zeros": ("nothing", "black", ""),
     "backproject": ("back-projection", PALETTE[0], "o"),
@@ -40,8 +40,8 @@ _METHODS = {
     "surface": ("surface", "#56b4e9", "<"),
     "truth": ("truth", "black", ""),
 }
-# Methods that some tables call otherwise.
-_ALSO = {
+# Other names of methods in tables.
+_ALIASES = {
     "backproject + clusters": "backproject + cluster",
     "backproject + our U-Net": "backproject + unet",
     "back-projection": "backproject",
@@ -51,81 +51,8 @@ _ALSO = {
 _DENSE = ", dense"
 # Perceptually uniform, of matplotlib.
 IMAGES = "magma"
-# Of the width of an image, at most, for the bar that says how long a length is.
+# Largest length of a scale bar, as a share of the image's width.
 _BAR = 0.3
-
-
-def label_of(method: str) -> str:
-    """What a method is called in a picture; an unknown one as it is."""
-    name = method.removesuffix(_DENSE)
-    name = _ALSO.get(name, name)
-    return _METHODS.get(name, (name,))[0] + method[len(method.removesuffix(_DENSE)) :]
-
-
-def line_of(method: str) -> dict[str, Any]:
-    """Label, colour, marker and line of a method, the same in every picture; dense matrices have dashes."""
-    name = method.removesuffix(_DENSE)
-    _, colour, marker = _METHODS.get(_ALSO.get(name, name), (name, "black", "."))
-    style = ":" if not marker else "--" if method.endswith(_DENSE) else "-"
-    return {"label": label_of(method), "color": colour, "marker": marker, "ls": style, "ms": 5}
-
-
-def draw_image(
-    axes: Axes,
-    image: Num[np.ndarray, "row column"],
-    extent: tuple[float, float, float, float],
-    *,
-    low: float = 0.0,
-    high: float | None = None,
-    upward: bool = False,
-    cmap: str = IMAGES,
-) -> AxesImage:
-    """An image without axes, with a bar that says how long, from `low` to `high`, by default its maximum.
-
-    Parameters
-    ----------
-    axes
-        Where.
-    image
-        Rows downwards.
-    extent
-        `(left, right, bottom, top)`, mm.
-    low, high
-        What is darkest and brightest.
-    upward
-        +y upwards, as some scenes were drawn, not downwards as on the sensor.
-    cmap
-        Of matplotlib; perceptually uniform.
-    """
-    high = float(image.max()) if high is None else high
-    shown = axes.imshow(image, cmap=cmap, vmin=low, vmax=max(high, low + 1e-12), extent=extent, interpolation="none")
-    axes.set(xticks=[], yticks=[])
-    if upward:
-        axes.invert_yaxis()
-    _draw_bar(axes, abs(extent[1] - extent[0]), colormaps[cmap](1.0))
-    return shown
-
-
-def round_length(most: float) -> float:
-    """The longest of 1, 2 or 5 times a power of ten that is not above."""
-    power = 10.0 ** np.floor(np.log10(most))
-    return float(max(step for step in (1, 2, 5) if step * power <= most * (1 + 1e-9)) * power)
-
-
-def _draw_bar(axes: Axes, width: float, colour) -> None:
-    length = round_length(_BAR * width)
-    x, part = 0.95 - length / width, length / width
-    axes.plot([x, x + part], [0.05, 0.05], color=colour, lw=2.5, solid_capstyle="butt", transform=axes.transAxes)
-    # Dark behind, for images that are bright there.
-    box = {"facecolor": colormaps[IMAGES](0.0), "alpha": 0.6, "lw": 0, "pad": 1}
-    place = {"ha": "center", "va": "bottom", "transform": axes.transAxes, "bbox": box}
-    axes.text(x + part / 2, 0.08, _length_text(length), color=colour, fontsize=9, **place)
-
-
-def _length_text(length: float) -> str:
-    return f"{length:g} mm" if length >= 1 else f"{1000 * length:g} um"
-
-
 # Voxels that are sampled for the median of a volume.
 _SAMPLED = 20_000_000
 # Cells along a side of a maximum projection, at most: fewer than pixels of the picture, so that none is left out.
@@ -146,8 +73,78 @@ _ON_INPUT = (
 )
 
 
+def label_of(method: str) -> str:
+    """Label of a method in pictures; an unknown one as it is."""
+    return line_of(method)["label"]
+
+
+def line_of(method: str) -> dict[str, Any]:
+    """Label, colour, marker and line of a method, the same in every picture; dense matrices have dashes."""
+    name = method.removesuffix(_DENSE)
+    dense = method[len(name) :]
+    label, colour, marker = _METHODS.get(_ALIASES.get(name, name), (name, "black", "."))
+    style = ":" if not marker else "--" if dense else "-"
+    return {"label": label + dense, "color": colour, "marker": marker, "ls": style, "ms": 5}
+
+
+def draw_image(
+    axes: Axes,
+    image: Num[np.ndarray, "row column"],
+    extent: tuple[float, float, float, float],
+    *,
+    low: float = 0.0,
+    high: float | None = None,
+    upward: bool = False,
+    cmap: str = IMAGES,
+) -> AxesImage:
+    """Draw an image with a scale bar in place of axes.
+
+    Parameters
+    ----------
+    axes
+        Axes to draw in.
+    image
+        Gray values.
+    extent
+        `(left, right, bottom, top)`, mm.
+    low, high
+        Values of black and white; `high` is by default the maximum.
+    upward
+        +y upwards, as some scenes were drawn, not downwards as on the sensor.
+    cmap
+        Color map of matplotlib.
+    """
+    high = float(image.max()) if high is None else high
+    shown = axes.imshow(image, cmap=cmap, vmin=low, vmax=max(high, low + 1e-12), extent=extent, interpolation="none")
+    axes.set(xticks=[], yticks=[])
+    if upward:
+        axes.invert_yaxis()
+    _draw_bar(axes, abs(extent[1] - extent[0]), colormaps[cmap](1.0))
+    return shown
+
+
+def round_length(most: float) -> float:
+    """The longest of 1, 2 or 5 times a power of ten that is not above."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max(step for step in (1, 2, 5) if step * power <= most * (1 + 1e-9)) * power)
+
+
+def _draw_bar(axes: Axes, width: float, colour) -> None:
+    length = round_length(_BAR * width)
+    start, share = 0.95 - length / width, length / width
+    axes.plot([start, 0.95], [0.05, 0.05], color=colour, lw=2.5, solid_capstyle="butt", transform=axes.transAxes)
+    # Dark behind, for images that are bright there.
+    box = {"facecolor": colormaps[IMAGES](0.0), "alpha": 0.6, "lw": 0, "pad": 1}
+    style = {"ha": "center", "va": "bottom", "transform": axes.transAxes, "bbox": box}
+    axes.text(start + share / 2, 0.08, _length_text(length), color=colour, fontsize=9, **style)
+
+
+def _length_text(length: float) -> str:
+    return f"{length:g} mm" if length >= 1 else f"{1000 * length:g} um"
+
+
 def to_uint8(values: Num[np.ndarray, "*shape"], low: float, high: float) -> UInt8[np.ndarray, "*shape"]:
-    """Scales values from `low` to `high` to 0 to 255 and clips the others."""
+    """Scale values from `low` to `high` to 0 to 255 and clip the others."""
     width = high - low if high > low else 1.0
     return np.clip((np.asarray(values, np.float32) - low) * (255 / width) + 0.5, 0, 255).astype(np.uint8)
 
@@ -157,13 +154,21 @@ def color_table(name: str) -> list[int]:
     return colormaps[name](np.arange(256), bytes=True)[:, :3].ravel().tolist()
 
 
-def png_uri(image: UInt8[np.ndarray, "row column"], colors: str = "gray", transparent: int | None = None) -> str:
-    """An image in the colors of a map of matplotlib, one value of which may be transparent, as PNG in a data URI."""
+def png_uri(image: UInt8[np.ndarray, "row column"], colors: str = "gray") -> str:
+    """An image in the colors of a map of matplotlib, as PNG in a data URI."""
     picture = Image.fromarray(image, mode="L" if colors == "gray" else "P")
     if colors != "gray":
         picture.putpalette(color_table(colors))
-    file = io.BytesIO()
-    picture.save(file, "PNG", **({} if transparent is None else {"transparency": transparent}))
+    return _data_uri(lambda file: picture.save(file, "PNG"))
+
+
+def figure_uri(figure: Figure, dpi: int = 100) -> str:
+    """A figure as PNG in a data URI."""
+    return _data_uri(lambda file: figure.savefig(file, format="png", dpi=dpi))
+
+
+def _data_uri(write: Callable[[io.BytesIO], object]) -> str:
+    write(file := io.BytesIO())
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
@@ -238,14 +243,30 @@ def make_slices(volume: Num[np.ndarray, "depth row column"], grid: Grid, max_byt
     return Slices(pictures, depths, low, high, step, extent, len(volume), brightest)
 
 
-def slider_html(slices: Slices, overlays: Sequence[str] = ()) -> str:
-    """An HTML figure with a slider through slices, at first at the brightest; `overlays` are SVG drawings, one a slice.
+def volume_html(
+    volume: Num[np.ndarray, "depth row column"],
+    grid: Grid,
+    points: Points | None = None,
+    *,
+    maxima: Figure | None = None,
+    max_bytes: int = _NOTEBOOK_BYTES,
+) -> str:
+    """HTML of a slider through slices, at most `max_bytes` before compression, above maximum projections.
 
-    A bar says how long a length is, and the caption where the edges are.
+    `maxima` is the figure that `show` returns for the same volume; by default it is drawn.
     """
+    slices = make_slices(volume, grid, max_bytes)
+    overlays = [] if points is None else _circle_overlays(np.asarray(points), slices)
+    picture = figure_uri(show(volume, grid, points=points) if maxima is None else maxima, _NOTEBOOK_DPI)
+    projections = f'<img src="{picture}" alt="Maxima along z, x and y" style="max-width:100%">'
+    return f"<div>{_slider_html(slices, overlays)}{projections}</div>"
+
+
+def _slider_html(slices: Slices, overlays: Sequence[str] = ()) -> str:
+    """A figure with a slider through slices, at first at the brightest; `overlays` are SVG drawings, one per slice."""
     start, labels = slices.brightest, [f"{z:.5g} mm" for z in slices.depths]
     left, right, bottom, top = slices.extent
-    bar = scale_bar_html(right - left)
+    bar = _scale_bar_html(right - left)
     planes = "".join(
         f'<div class="plane" data-depth="{z}" style="position:relative"{"" if k == start else " hidden"}>'
         f'<img class="picture" src="{picture}" alt="The volume at {z}" style="display:block;width:100%">'
@@ -266,8 +287,8 @@ def slider_html(slices: Slices, overlays: Sequence[str] = ()) -> str:
     )
 
 
-def scale_bar_html(width: float) -> str:
-    """A bar with its length over a picture of so many mm: HTML for the end of an element of `position: relative`."""
+def _scale_bar_html(width: float) -> str:
+    """A scale bar over a picture that is `width` mm wide: HTML for the end of an element of `position: relative`."""
     length = round_length(_BAR * width)
     return (
         f'<div style="position:absolute;right:4%;bottom:4%;width:{100 * length / width:.4g}%;border-bottom:3px solid '
@@ -294,20 +315,14 @@ def _circle_overlays(points: Float[np.ndarray, "point 4"], slices: Slices) -> li
 
 
 class _VolumeFigure(Figure):
-    """Projections; a notebook shows them below slices of the volume."""
+    """Maximum projections, which notebooks show below slices of the volume."""
 
     def __init__(self, volume, grid, points, **options):
         super().__init__(**options)
         self._data = volume, grid, points
 
     def _repr_html_(self) -> str:
-        volume, grid, points = self._data
-        slices = make_slices(volume, grid, _NOTEBOOK_BYTES)
-        file = io.BytesIO()
-        self.savefig(file, format="png", dpi=_NOTEBOOK_DPI)
-        maxima = f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
-        overlays = [] if points is None else _circle_overlays(np.asarray(points), slices)
-        return f'<div>{slider_html(slices, overlays)}<img src="{maxima}" alt="Maxima along z, x and y"></div>'
+        return volume_html(*self._data, maxima=self)
 
 
 @host_code()
@@ -379,8 +394,7 @@ def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Po
 
 def _draw_maxima(axes, across, along, maxima, norm):
     steps = [-(-n // _MAX_CELLS) for n in maxima.shape]
-    edges = (np.append(at[:-1:step], at[-1]) for at, step in zip((along, across), steps, strict=True))
-    down, right = edges
+    down, right = (np.append(at[:-1:step], at[-1]) for at, step in zip((along, across), steps, strict=True))
     return axes.pcolormesh(right, down, block_maxima(maxima, steps), cmap="magma", norm=norm, rasterized=True)
 
 

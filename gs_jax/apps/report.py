@@ -1,35 +1,71 @@
 """The HTML report of a design and of what was imaged with it, in one file."""
 
+import json
+import re
+import shlex
 from collections.abc import Mapping
 from importlib import import_module, resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Num
+from jaxtyping import Array, Float, Num
+from matplotlib.figure import Figure
 
 from ..base.errors import InputError, needs_extra
+from ..base.machine import describe
 from ..base.progress import Progress
-from ..design.datasheets import datasheet, findings
-from ..design.design import Design, design_text
+from ..design.conversion import NO_SAMPLE, default_sample, object_begins
+from ..design.datasheets import circle_of_confusion_of, datasheet, findings
+from ..design.design import Design, design_text, span_of
 from ..geometry import Imager
 from ..grid import Grid
-from ..io.files import check_output, write_text
+from ..io.files import check_output, read_text, write_text
 from ..io.provenance import Provenance
 from ..io.volumes import SurfaceMaps, surface_mesh
+from ..mold.lenslets import Part
+from ..mold.solids import MoldShape, preview_solid
 from ..optics.raytrace import to_numpy
 from ..typing import Image, PathLike, Points
-from . import report_tables as tables
 from .drawings import Psfs, count_lenses, draw_layout, draw_section, ideal_mtf, line_chart, mtf, simulate_psfs
-from .pictures import color_table, make_slices, png_uri, scale_bar_html, slider_html, to_base64, to_uint8
+from .pictures import (
+    block_maxima,
+    color_table,
+    display_range,
+    downsample,
+    figure_uri,
+    png_uri,
+    shade,
+    to_base64,
+    to_uint8,
+    volume_html,
+)
 
-PAPER = {
-    "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
-    "Complexity”, Laser & Photonics Reviews 15, 2100072 (2021)",
-    "doi": "10.1002/lpor.202100072",
+# Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.datasheets`; least Strehl ratio in figures.
+_FAR, _MIN_STREHL = 2.0, 0.01
+SLICE_BYTES = 6_000_000  # of all slices, before compression
+# Voxels in space, in all and along a side; points in space and in the table; pixels along a capture, and of its middle.
+_MAX_VOXELS, _MAX_SIDE, _MAX_POINTS, _LISTED_POINTS, _MAX_CAPTURE, _MIDDLE = 60_000, 200, 5000, 300, 900, 500
+_MAX_COLUMNS = 40_000  # of sheets in space
+# Title, unit and source of the datasheet's rows.
+_ROWS = {
+    "magnification": ("magnification M", "", "Eq. 3"),
+    "scale": ("scale of the pattern", "", "Eq. 1"),
+    "lateral_resolution_um": ("lateral resolution, predicted", "um", "Eq. 5"),
+    "axial_resolution_um": ("axial resolution, predicted", "um", "Eq. 6"),
+    "fwhm_um": ("full width at half maximum of the PSF on the axis, in the object", "um", "diffraction"),
+    "rms_width_um": ("RMS width of the PSF, in the object", "um", "exact rays"),
+    "half_light_radius_um": ("radius of half of the light, in the object", "um", "exact rays"),
+    "spot_radius_um": ("radius of 80 % of the light, in the object", "um", "exact rays"),
+    "blur_um": ("blur of a thin lens on the sensor", "um", ""),
+    "focus_distance_mm": ("image at", "mm", ""),
+    "depth_of_field_mm": ("depth of field, if focused there", "mm", "Eq. 8"),
+    "near_limit_mm": ("from", "mm", "Eq. 8"),
+    "far_limit_mm": ("to", "mm", "Eq. 8"),
+    "strehl_on_axis": ("Strehl ratio on the axis", "", "Eq. 9"),
+    "lenses_per_point": ("lenses that see a point", "", ""),
+    "occupancy": ("occupancy", "", "Eq. 11"),
 }
-# Points in the table, the brightest.
-_LISTED_POINTS = 300
 
 
 def write_report(
@@ -47,7 +83,7 @@ def write_report(
     provenance: Provenance | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Writes an HTML report of a design, and of what was imaged with it, atomically.
+    """Write an HTML report of a design, and of what was imaged with it, atomically.
 
     The page needs no network and contains no path of this machine. It has less than 15 MB, whatever the volume's size.
 
@@ -88,51 +124,39 @@ def write_report(
         import_module("jinja2")
     if volume is not None and (grid is None or volume.shape != grid.volume_shape):
         raise ValueError(f"`volume` must have the shape of `grid`, got {volume.shape}.")
-    context: dict[str, Any] = {
+    context = {
         "design": design,
         "notes": dict.fromkeys(("page", "capture", "volume", "points"), "") | dict(notes or {}),
-        "paper": PAPER,
         "colors": {name: color_table(name) for name in ("magma", "viridis")},
-        "calibration": tables.calibration_rows(design),
-        "calibration_summary": tables.calibration_summary(design),
-        "tolerance": tables.tolerance_table(tolerance) if tolerance else None,
-        "capture": None if image is None else tables.capture_view(np.asarray(image)),
-        "volume": None,
-        "surface": None,
-        "points": None,
+        "tolerance": tolerance and tolerance_section(tolerance),
+        **_calibration(design),
         **_origins(design, provenance, origins or {}),
         **_optics(design, progress),
     }
+    views = {}
     with progress.step("Mold"):
-        context |= _mold(design)
+        views["mold"], context["no_mold"] = _mold(design)
     with progress.step("Pictures"):
-        if context["tolerance"]:
-            labels: Any = {"x": "depth z, mm", "y": "width of a spot, um", "title": "Spots by depth"}
-            context["tolerance_chart"] = line_chart(context["tolerance"].widths, **labels, marks=True)
+        context["capture"] = None if image is None else _capture(np.asarray(image))
+        context["volume"] = context["surface"] = context["points"] = None
         if volume is not None and grid is not None:
             volume = np.asarray(volume)
             context["volume"] = {
                 "shape": volume.shape,
                 "pitch_um": 1000 * grid.pitch,
                 "depths": np.asarray(grid.depths, float),
-                "slider": slider_html(make_slices(volume, grid, tables.SLICE_BYTES)),
-                "projections": tables.make_projections(volume, grid),
-                "bar": scale_bar_html(grid.shape[1] * grid.pitch),
-                "extent": grid.extent,
+                "html": volume_html(volume, grid, max_bytes=SLICE_BYTES),
             }
-            context["views"]["volume"] = tables.voxel_view(volume, grid)
+            views["volume"] = voxel_view(volume, grid)
         if surface is not None:
-            sheets, low, high = sheet_pictures(surface)
-            shape, pitch = surface.depth.shape, 1000 * surface.grid.pitch
-            context["surface"] = {"sheets": sheets, "low": low, "high": high, "shape": shape, "pitch_um": pitch}
-            if view := surface_view(surface):
-                context["views"]["surface"] = view
+            context["surface"] = {"shape": surface.depth.shape, "pitch_um": 1000 * surface.grid.pitch}
+            context["surface"]["picture"] = figure_uri(_draw_sheets(surface))
+            views["surface"] = _surface_view(surface)
         if points is not None:
-            points = np.asarray(points, float)
-            listed = points[np.argsort(-points[:, 3], kind="stable")[:_LISTED_POINTS]]
-            context["points"] = {"count": len(points), "listed": listed.tolist()}
-            if len(points):
-                context["views"]["points"] = tables.point_view(points, grid)
+            brightest = np.asarray(points, float)[np.argsort(-np.asarray(points)[:, 3], kind="stable")]
+            context["points"] = {"count": len(points), "listed": brightest[:_LISTED_POINTS].tolist()}
+            views["points"] = _point_view(brightest[:_MAX_POINTS, :3], grid) if len(points) else None
+    context["views"] = {name: view for name, view in views.items() if view}
     write_text(path, render("report.html", context), [".html"])
 
 
@@ -150,19 +174,8 @@ def render(name: str, context: Mapping[str, Any]) -> str:
     return environment.from_string(read(name)).render({**embedded, **context})
 
 
-def _origins(design: Design, provenance: Provenance | None, origins: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    own = {key: value for key, value in design.provenance.items() if not key.startswith("calibrated_")}
-    by_name = {"this page": provenance or {}, "the design": own}
-    by_name |= {Path(name).name: origin for name, origin in origins.items()}
-    rows = {name: tables.provenance_rows(origin) for name, origin in by_name.items()}
-    return {
-        "versions": tables.versions(),
-        "origins": {name: each for name, each in rows.items() if each},
-        "design_text": tables.strip_folders(design_text(design)),
-    }
-
-
 def _optics(design: Design, progress: Progress) -> dict[str, Any]:
+    """Sections of the device, the datasheet, spots, contrast and layout."""
     with progress.step("Datasheet"):
         sheet = datasheet(design)
         violations = findings(design, sheet)
@@ -184,17 +197,18 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
         "predicted (Eq. 5)": (depths, sheet["lateral_resolution_um"]),
         "axial, predicted (Eq. 6)": (depths, sheet["axial_resolution_um"]),
     }
-    labels: Any = {"x": "depth z, mm", "y": "in the object, um", "title": "Resolution by depth"}
     return {
         "sheet": sheet,
-        "sheet_rows": tables.datasheet_rows(design, sheet),
+        "sheet_rows": _datasheet_rows(design, sheet),
         "violations": violations,
-        "device": tables.device_rows(design, sheet),
+        "device": device_rows(design, sheet),
         "section": section,
         "layout": layout,
         "seen": {"depth": middle, "most": int(counts.lenses.max()), "mean": counts.mean},
         "count_bar": png_uri(np.arange(256, dtype=np.uint8)[None], "viridis"),
-        "widths": line_chart(widths, **labels, log=True, marks=True),
+        "widths": line_chart(
+            widths, x="depth z, mm", y="in the object, um", title="Resolution by depth", log=True, marks=True
+        ),
         "psfs": _psf_pictures(psfs, imager),
         **_mtf_charts(psfs, imager, diameter),
     }
@@ -204,12 +218,11 @@ def _psf_pictures(psfs: Psfs, imager: Imager) -> dict[str, Any]:
     peaks = psfs.images.max((2, 3), keepdims=True)
     root = to_uint8(np.sqrt(psfs.images / np.where(peaks > 0, peaks, 1)), 0.0, 1.0)
     rows = [
-        [(png_uri(root[i, j], "magma"), 100 * float(psfs.caught[i, j])) for i in range(len(psfs.depths))]
-        for j in range(len(psfs.heights))
+        (height, [(png_uri(root[i, j], "magma"), 100 * float(psfs.caught[i, j])) for i in range(len(psfs.depths))])
+        for j, height in enumerate(psfs.heights)
     ]
     size = root.shape[-1]
-    width = 1000 * size * imager.sensor.pixel_pitch
-    return {"depths": psfs.depths, "rows": list(zip(psfs.heights, rows, strict=True)), "size": size, "width_um": width}
+    return {"depths": psfs.depths, "rows": rows, "size": size, "width_um": 1000 * size * imager.sensor.pixel_pitch}
 
 
 def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
@@ -232,49 +245,257 @@ def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
     }
 
 
-def _mold(design: Design) -> dict[str, Any]:
-    if design.lens.focal_length_mm is not None:
-        return {"views": {}, "no_mold": "an ideal lens has no surface."}
+def _datasheet_rows(design: Design, sheet: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the datasheet by depth; a cell is a text and the assumption that its value violates, or ""."""
+    circle_of_confusion = 1000 * circle_of_confusion_of(design, None)
+
+    def violation(key: str, i: int, value: float | None) -> str:
+        if value is None:
+            return ""
+        if key == "blur_um" and value > circle_of_confusion:
+            return f"out of focus: more than the circle of confusion, {circle_of_confusion:.3g} um"
+        if key == "rms_width_um" and sheet["spot_width_um"][i] > _FAR * sheet["lateral_resolution_um"][i]:
+            return "2.355 times it, as of a Gaussian, is more than twice the prediction of Eq. 5"
+        if key == "occupancy" and value > 1:
+            return "sub-images of an object that fills the field overlap"
+        return ""
+
+    def text(key: str, value: float | None) -> str:
+        is_poor = key == "strehl_on_axis" and value is not None and value < _MIN_STREHL
+        return f"< {_MIN_STREHL:g}" if is_poor else _number(value)
+
+    return [
+        dict(zip(("name", "unit", "source"), titles, strict=True))
+        | {"cells": [(text(key, value), violation(key, i, value)) for i, value in enumerate(sheet[key])]}
+        for key, titles in _ROWS.items()
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "infinite" if value is None else f"{value:.4g}"
+
+
+def device_rows(design: Design, sheet: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and values of the main properties of the microscope."""
+    sensor, lens, array, imaging = design.sensor, design.lens, design.array, design.imaging
+    rows, columns = sensor.shape
+    height, width = (f"{n * sensor.pixel_pitch_um / 1000:.4g}" for n in sensor.shape)
+    shape = f"radius {span_of(lens.radius_of_curvature_mm)} mm, index {design.refractive_index:g}"
+    if lens.focal_length_mm is not None:
+        shape = "ideal, thin"
+    conic = f", conic constant {span_of(lens.conic_constant)}" if lens.conic_constant else ""
+    terms = f", {len(lens.aspheric_terms)} aspheric terms" if lens.aspheric_terms else ""
+    return [
+        ("lenses", f"{len(array.centers_mm)} on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm"),
+        ("a lens", f"{shape}{conic}{terms}, {span_of(lens.aperture_diameter_mm)} mm wide"),
+        ("faces the object", f"the lenses' {lens.orientation} side"),
+        ("focal length", f"{_number(sheet['focal_length_mm'])} mm"),
+        ("F-number, NA", f"{_number(sheet['f_number'])}, {_number(sheet['numerical_aperture'])}"),
+        ("pitch", f"{_number(sheet['pitch_mm'])} mm (SD {_number(sheet['pitch_sd_mm'])} mm)"),
+        ("plate", f"{array.substrate_thickness_mm:g} mm thick, {100 * sheet['coverage']:.1f} % covered by lenses"),
+        ("sensor", f"{rows} x {columns} pixels of {sensor.pixel_pitch_um:g} um: {height} x {width} mm"),
+        ("sensor distance", f"{imaging.sensor_distance_mm:g} mm"),
+        *_path_rows(design),
+        ("objects at", f"{imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm"),
+        ("light", f"{imaging.wavelength_nm:g} nm"),
+        ("field radius", f"{imaging.field_radius_mm:g} mm"),
+    ]
+
+
+def _path_rows(design: Design) -> list[tuple[str, str]]:
+    layers, sample = design.layers, default_sample(design)
+    sides = {"on the array": layers.object, "before the object": sample.layers, "on the sensor": layers.sensor}
+
+    def text(layer) -> str:
+        if layer.refractive_index in (1, "air"):
+            return f"{layer.name or 'air'}, {layer.thickness_mm:g} mm"
+        return f"{layer.name or 'layer'}, {layer.thickness_mm:g} mm, n = {layer.refractive_index}"
+
+    rows = [(side, "; ".join(map(text, slabs))) for side, slabs in sides.items() if slabs]
+    medium = "air" if sample == NO_SAMPLE else f"n = {sample.refractive_index} from {object_begins(design):g} mm"
+    return [*rows, ("objects in", medium)]
+
+
+def _calibration(design: Design) -> dict[str, Any]:
+    """Names, values and standard deviations from `gs-jax calibrate`, and its fit in a line; empty without them."""
+    record = design.provenance
+    values, deviations = (record.get(key, {}) for key in ("calibrated_values", "standard_deviations"))
+    rows = []
+    if isinstance(values, dict) and isinstance(deviations, dict):
+        rows = [(name, value, deviations.get(name, "")) for name, value in values.items()]
+    spots = f"{record.get('calibrated_spots')} spots of {record.get('calibrated_captures', '?')} captures"
+    summary = f"{spots}, {record.get('calibrated_rms_pixels', '?')} pixels RMS"
+    summary += ", mirrored." if record.get("mirrored") else "."
+    return {"calibration": rows, "calibration_summary": summary if "calibrated_spots" in record else ""}
+
+
+def read_tolerance(path: PathLike) -> dict[str, Any]:
+    """Read the JSON of `gs-jax tolerance -o`; `InputError` for other contents."""
     try:
-        return {"views": {"mold": tables.mold_view(design.imager().array)}, "no_mold": ""}
-    except (InputError, ValueError) as error:
-        return {"views": {}, "no_mold": str(error)}
+        numbers = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON: {str(error):.200}.") from error
+    tolerance_section(numbers, str(path))
+    return numbers
 
 
-# Pixels along a picture, and columns of sheets in space.
-_MAX_PIXELS, _MAX_COLUMNS = 720, 40_000
+def tolerance_section(numbers: Mapping[str, Any], name: str = "tolerance") -> dict[str, Any]:
+    """The yield as a sentence, a row per tolerance, and a chart of spot widths, from the JSON of `gs-jax tolerance`.
+
+    Raises `InputError` for other contents, with the `name` of the file.
+    """
+    try:
+        depths, devices, without = numbers["depth_mm"], numbers["drawn"], numbers.get("yield_without", {})
+        rows = [
+            (name, *("-" if x is None else f"{x:.3g}" for x in changes.values()))
+            + (f"{100 * without[name]:.3g}" if name in without else "",)
+            for name, changes in numbers["over_depths"].items()
+        ]
+        widths = {
+            "as designed": (depths, numbers["nominal"]["spot_width_um"]),
+            "devices, median": (depths, devices["spot_width_um"]["p50"]),
+            "5 %": (depths, devices["spot_width_um"]["p5"]),
+            "95 %": (depths, devices["spot_width_um"]["p95"]),
+            "target": (depths, numbers["targets"]["max_width_um"]),
+        }
+        summary = f"{100 * numbers['yield']:.3g} % of {devices['devices']} devices keep all targets."
+        chart = line_chart(widths, x="depth z, mm", y="width of a spot, um", title="Spots by depth", marks=True)
+        return {"summary": summary, "rows": rows, "chart": chart}
+    except KeyError as error:
+        raise InputError(f"{name}: must be what `gs-jax tolerance -o` writes, got no {error}.") from error
+    except (TypeError, AttributeError, ValueError) as error:
+        raise InputError(f"{name}: must be what `gs-jax tolerance -o` writes, got {error!r:.80}.") from error
 
 
-def surface_view(maps: SurfaceMaps) -> dict[str, Any] | None:
+# An absolute path, with its last component as the group.
+_ABSOLUTE = re.compile(r"""(?<![^\s='"(\[,])(?:file://)?(?:[A-Za-z]:)?[\\/](?:[^\s'"=,]*[\\/])?([^\s'"\\/=,]+)""")
+
+
+def strip_folders(text: str) -> str:
+    """Replace absolute paths in a text, or in a command of `gs-jax`, by the names of the files."""
+    try:
+        words = shlex.split(text) if text.startswith("gs-jax ") else []
+    except ValueError:
+        words = []
+    return _ABSOLUTE.sub(r"\1", shlex.join(map(_strip_folder, words)) if words else text)
+
+
+def _strip_folder(word: str) -> str:
+    option, equals, value = word.partition("=")
+    if option.startswith("-") and equals:
+        return f"{option}={_strip_folder(value)}"
+    return re.split(r"[\\/]", word.rstrip("\\/"))[-1] if re.match(r"(?:[A-Za-z]:)?[\\/]", word) else word
+
+
+def _origins(design: Design, provenance: Provenance | None, origins: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Provenance without folders, and without the text of designs; versions of the software that writes the page."""
+    own = {key: value for key, value in design.provenance.items() if not key.startswith("calibrated_")}
+    by_name = {"this page": provenance or {}, "the design": own}
+    by_name |= {Path(name).name: origin for name, origin in origins.items()}
+
+    def text(value) -> str:
+        return strip_folders(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+
+    rows = {
+        name: [(str(key), text(value)) for key, value in origin.items() if key != "design"]
+        for name, origin in by_name.items()
+    }
+    machine = describe()
+    return {
+        "versions": [(name, machine[name]) for name in ("gs-jax", "python", "jax", "system")],
+        "origins": {name: values for name, values in rows.items() if values},
+        "design_text": strip_folders(design_text(design)),
+    }
+
+
+def _capture(image: Num[np.ndarray, "row column"]) -> dict[str, Any]:
+    """Pictures of the whole, each pixel a mean of `step` x `step`, and of its middle."""
+    low, high = (float(v) for v in np.percentile(image, (0.5, 99.8)))
+    middle = image[tuple(slice(max((n - _MIDDLE) // 2, 0), (n + _MIDDLE) // 2) for n in image.shape)]
+    whole, crop = (png_uri(to_uint8(pixels, low, high)) for pixels in (downsample(image, _MAX_CAPTURE), middle))
+    return {"whole": whole, "middle": crop, "step": -(-max(image.shape) // _MAX_CAPTURE), "shape": image.shape}
+
+
+def _draw_sheets(maps: SurfaceMaps) -> Figure:
+    """Brightness and depth of each sheet, mm, and the median standard deviation of its depths; dark ones are blank."""
+    count, lit = len(maps.depth), maps.depth[np.isfinite(maps.depth)]
+    low, high = np.percentile(lit, (0.5, 99.5)) if lit.size else (0.0, 0.0)
+    figure = Figure(figsize=(9, 3.8 * count), layout="constrained")
+    rows = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
+    for number, (row, *sheet) in enumerate(zip(rows, maps.brightness, maps.depth, maps.depth_sd, strict=True), 1):
+        name, (brightness, depth, sd) = f" of sheet {number}" if count > 1 else "", sheet
+        row[0].imshow(brightness, "gray", vmin=0, vmax=np.percentile(brightness, 99.5), extent=maps.grid.extent)
+        image = row[1].imshow(depth, "viridis", vmin=low, vmax=high, extent=maps.grid.extent)
+        figure.colorbar(image, ax=row[1], label="z, mm")
+        error = f", SD {np.nanmedian(sd):.2g} mm at the median" if np.isfinite(sd).any() else ""
+        for axes, title in zip(row, ("brightness", "depth"), strict=True):
+            axes.set(title=title + name + (error if title == "depth" else ""), xlabel="x, mm", ylabel="y, mm")
+    return figure
+
+
+def voxel_view(volume: Float[np.ndarray, "depth row column"], grid: Grid) -> dict[str, Any]:
+    """The brightest voxels for the browser: indices of voxels, and brightness from 1 to 255."""
+    step = [-(-n // _MAX_SIDE) for n in volume.shape]
+    values = shade(block_maxima(volume, step), *display_range(volume))
+    # Of voxels that are equally bright, a random selection.
+    rank = values.ravel() + np.random.default_rng(0).random(values.size, np.float32)
+    kept = np.argsort(-rank)[: min(_MAX_VOXELS, np.count_nonzero(values))]
+    z, y, x = np.unravel_index(np.sort(kept), values.shape)
+    middles = np.minimum(np.arange(values.shape[0]) * step[0] + (step[0] - 1) // 2, len(grid.depths) - 1)
+    left, _, _, top = grid.extent
+    pitch_x, pitch_y = grid.pitch * step[2], grid.pitch * step[1]
+    return {
+        "kind": "cloud",
+        "count": len(kept),
+        "voxels": to_base64(np.column_stack([x, y, z, values[z, y, x]]).astype(np.uint8)),
+        "pitch": [pitch_x, pitch_y],
+        "first": [left + pitch_x / 2, top + pitch_y / 2],
+        "depths": np.asarray(grid.depths, float)[middles].tolist(),
+        "box": _box(grid),
+    }
+
+
+def _box(grid: Grid) -> list[list[float]]:
+    left, right, bottom, top = grid.extent
+    z = np.asarray(grid.depths, float)
+    return [[left, top, float(z.min())], [right, bottom, float(z.max())]]
+
+
+def _point_view(points: Float[np.ndarray, "point 3"], grid: Grid | None) -> dict[str, Any]:
+    """Points for the browser."""
+    box = _box(grid) if grid is not None else [points.min(0).tolist(), points.max(0).tolist()]
+    return {"kind": "points", "count": len(points), "places": to_base64(points.astype(np.float32)), "box": box}
+
+
+def _surface_view(maps: SurfaceMaps) -> dict[str, Any] | None:
     """Sheets for the browser, with the brightness of each vertex from 0 to 255; None if all is dark."""
     step = int(np.ceil(np.sqrt(maps.depth.size / _MAX_COLUMNS)))
     first = np.s_[:, step // 2 :: step, step // 2 :: step]
     brightness, depth = maps.brightness[first], maps.depth[first]
     grid = Grid(maps.grid.depths, depth.shape[1:], maps.grid.pitch * step, maps.grid.origin)
     vertices, light, faces = surface_mesh(brightness, depth, grid)
-    return tables.mesh_view(vertices, faces) | {"light": to_base64(to_uint8(light, 0.0, 1.0))} if len(faces) else None
+    return _mesh_view(vertices, faces) | {"light": to_base64(to_uint8(light, 0.0, 1.0))} if len(faces) else None
 
 
-class SheetPictures(NamedTuple):
-    """Pictures of a sheet, transparent where it is dark, and the median standard deviation of its depth, mm."""
+def _mold(design: Design) -> tuple[dict[str, Any] | None, str]:
+    """The mold for the browser, or why there is none."""
+    if design.lens.focal_length_mm is not None:
+        return None, "an ideal lens has no surface."
+    try:
+        mesh = preview_solid(Part(design.imager().array), MoldShape()).to_mesh64()
+    except (InputError, ValueError) as error:
+        return None, str(error)
+    return _mesh_view(mesh.vert_properties[:, :3], mesh.tri_verts), ""
 
-    brightness: str
-    depth: str
-    sd: float
 
-
-def sheet_pictures(maps: SurfaceMaps) -> tuple[list[SheetPictures], float, float]:
-    """Pictures of each sheet, and the depths of the first and the last colour, mm."""
-    lit = np.isfinite(maps.depth)
-    low, high = np.percentile(maps.depth[lit], (0.5, 99.5)) if lit.any() else (0.0, 0.0)
-    pictures = []
-    for brightness, depth, sd in zip(maps.brightness, maps.depth, maps.depth_sd, strict=True):
-        # 0 is left for the dark.
-        colours = np.maximum(to_uint8(np.nan_to_num(depth, nan=low), low, high), 1) * np.isfinite(depth)
-        small = max(-(-max(depth.shape) // _MAX_PIXELS), 1)
-        light = to_uint8(brightness, 0.0, float(np.percentile(brightness, 99.5)))
-        depth_picture = png_uri(colours.astype(np.uint8)[::small, ::small], "viridis", transparent=0)
-        known = sd[np.isfinite(sd)]
-        middle = float(np.median(known)) if known.size else 0.0
-        pictures.append(SheetPictures(png_uri(light[::small, ::small]), depth_picture, middle))
-    return pictures, float(low), float(high)
+def _mesh_view(vertices: np.ndarray, facets: np.ndarray) -> dict[str, Any]:
+    """A mesh for the browser: vertices as fractions of its box, and facets."""
+    low, high = vertices.min(0).astype(float), vertices.max(0).astype(float)
+    fractions = np.round((vertices - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    return {
+        "kind": "mesh",
+        "count": len(facets),
+        "corners": to_base64(fractions),
+        "facets": to_base64(facets.astype(np.uint32)),
+        "box": [low.tolist(), high.tolist()],
+    }

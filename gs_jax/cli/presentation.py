@@ -42,8 +42,7 @@ def report_command(
         capture: CAPTURE.tif: the capture of VOLUME.
         tolerance: TOLERANCE.json of `gs-jax tolerance -o`.
     """
-    from ..apps.report import write_report
-    from ..apps.report_tables import read_tolerance
+    from ..apps.report import read_tolerance, write_report
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
     from ..io.volumes import read_surface, read_volume
