@@ -6,7 +6,7 @@ the middle of the design's own sensor, and the diffraction of their clear area b
 are those of one exposure time for all designs: 20,000, 3,000 or 500 electrons in the brightest pixel of `geomscope`.
 Volumes are reconstructed with the full model on a grid that is the same for all, 40 x 40 x 300 um, three planes about
 each depth: by Richardson-Lucy, with the best of three numbers of steps for each scene, and by the unrolled inversion,
-on voxels half as wide, which are then shared linearly by those of the grid (`voxel_width.py`). Scores, after the best
+on voxels half as wide, which are then shared linearly by those of the grid. Scores, after the best
 gain: PSNR and SSIM; the contrast of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of
 two designs are of the same scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with
 its own noise. A second table has the error that the full model leaves of images without noise, of scenes that lie in

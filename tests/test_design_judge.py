@@ -7,7 +7,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import j1
 
-from experiments import design_changes, design_search
 from experiments.common import designs_by_name
 from experiments.design_judge import (
     IMAGES,
@@ -28,7 +27,6 @@ from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import write_design
-from gs_jax.optics.theory import depth_in_focus
 
 IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0)
 
@@ -125,16 +123,6 @@ def test_finer_voxels_are_shared_by_those_of_the_grid():
     assert np.corrcoef(found.ravel(), wanted.ravel())[0, 1] > 0.98
 
 
-@pytest.mark.parametrize("side", design_search.SIDES)
-def test_designs_of_the_search_have_the_focus_that_was_asked_for(side):
-    for part in (0.0, 0.5, 1.0):
-        at = design_search.LOW + part * (design_search.HIGH - design_search.LOW)
-        imager = design_search.design_of(side, at).imager()
-        np.testing.assert_allclose(float(imager.sensor_distance), at[0])
-        reduced = depth_in_focus(imager.array.focal_length, imager.reduced_sensor_distance)
-        np.testing.assert_allclose(imager.depth_of(reduced), at[1], rtol=1e-4)
-
-
 @pytest.mark.integration
 def test_emitters_that_share_rays_make_the_same_image():
     """Sums of squares of 8 pixels are the same to 3 % of their root mean square, the noise of 800,000 rays."""
@@ -145,17 +133,3 @@ def test_emitters_that_share_rays_make_the_same_image():
     assert shared.sum() == pytest.approx(own.sum(), rel=2e-3)
     error = squares(shared) - squares(own)
     assert np.linalg.norm(error) < 0.03 * np.linalg.norm(squares(own))
-
-
-def test_changes_of_the_microscope_are_designs():
-    start = geomscope()
-    for change in design_changes.CHANGES.values():
-        assert start.replace(**change).imager().array.centers.shape == (200, 2)
-    fewer = np.array(design_changes.fewer_lenses(start).array.centers_mm)
-    assert len(fewer) == pytest.approx(200 / design_changes.SPREAD**2, rel=0.1)
-
-
-def test_a_smooth_function_is_predicted_from_the_other_designs():
-    at = np.random.default_rng(0).uniform(size=(40, 3))
-    true = np.sin(3 * at[:, 0]) + at[:, 1] ** 2
-    assert np.corrcoef(design_search.predicted(at, true), true)[0, 1] > 0.99

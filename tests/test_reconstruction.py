@@ -14,7 +14,6 @@ import pytest
 from jax.test_util import check_grads
 
 import gs_jax as gs
-from experiments.solver_options import glow
 from gs_jax import Grid, ImagingOperator, backproject, forward, psf_model
 from gs_jax.apps.method_benchmark import skip_reason
 from gs_jax.base.errors import InputError
@@ -259,12 +258,6 @@ def test_methods_that_cannot_stop_at_the_noise(method):
     for function in (gs.reconstruct, gs.cross_validated):
         with pytest.raises(InputError, match=rf"must be used with .*, got {type(method).__name__}\(\)"):
             function(np.ones(imager.sensor.shape), imager, grid, method, stop_at_discrepancy=True)
-
-
-def test_the_glow_is_as_bright_as_it_says():
-    image = np.random.default_rng(0).uniform(1, 3, (60, 50))
-    added = glow(image)
-    assert added.max() == pytest.approx(2 * (image.mean() - np.percentile(image, 1)), rel=0.01) and added.min() > 0
 
 
 @cache

@@ -1,12 +1,12 @@
 """Recordings whose frames start from the volume of the one before."""
 
 import dataclasses
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 import gs_jax as gs
-from experiments.warm_start import Counted
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.plan import follow_volume
@@ -18,6 +18,22 @@ __all__ = ["folder"]
 
 STEPS = 16
 GRID = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
+
+
+class Counted(Progress):
+    """Counts the steps of iterations."""
+
+    steps = 0
+
+    @contextmanager
+    def counter(self, description, total, **_):
+        self.steps = 1
+
+        def advance():
+            # The step that ends an iteration early is not counted.
+            self.steps = min(self.steps + 1, total)
+
+        yield advance
 
 
 def scope():
