@@ -6,22 +6,26 @@
 - Random devices, simulated with all light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of up to
   2 mm, a tilt of up to 1 degree in each direction, a sensor distance up to 20 % off; three captures each. Deviations
   from the truth are given in standard deviations of the calibration.
+- Mistakes: the residuals that a fit of sensor distance, rotation and shift leaves if something else is wrong, by the
+  chief rays of the built-in design and sources at the four positions of `design/LAB.md`.
 
     python -m experiments.calibration [DATA] [--devices N] [--out DIR]
 
-DATA holds `P1.toml` and `P1_i_*.tif`; without it only the random devices run. Writes `calibration.json`,
+DATA holds `P1.toml` and `P1_i_*.tif`; without it its captures are left out. Writes `calibration.json`,
 `calibration.md` and `calibration.png`; about half an hour on two cores.
 """
 
 import json
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.optimize import least_squares
 
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
@@ -31,6 +35,8 @@ from gs_jax.calibration.calibrated_design import plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate, spot_residuals
 from gs_jax.calibration.spot_model import OF_DEVICE
 from gs_jax.design.design import read_design
+from gs_jax.design.start import geomscope
+from gs_jax.geometry import chief_ray
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
 from gs_jax.projection.point_sources import full_image_of_points
@@ -42,6 +48,10 @@ DEPTHS = (18.0, 20.0, 22.0)
 LENSES, PLATE, PIXELS, PIXEL, FIELD = 60, 11.0, 1536, 0.006, 2.5
 # Rotation of the design in the calibration from a scene, and depths of the scene, mm.
 TURN, SCENE = np.radians(2.0), [17.5, 22.5]
+# Sources of the laboratory guide, and the distance from one within which lenses count, where something else is wrong;
+# mm.
+SOURCES = np.array([[0.0, 0.0, 18.0], [0.0, 0.0, 20.5], [3.0, 0.0, 20.5], [0.0, 0.0, 23.0]])
+REACH = 6.0
 
 
 def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
@@ -69,16 +79,16 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     turned = eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + TURN)
     alone = self_calibrate(scene, turned, voxel_grid(turned, SCENE), progress=progress)
     return {
-        **_said(whole),
+        **_numbers(whole),
         "seconds": seconds,
-        "everything_fitted": _said(every),
+        "everything_fitted": _numbers(every),
         "held_out_rms_pixels": held_out,
         "points": scores,
-        "from_scene": _said(alone),
+        "from_scene": _numbers(alone),
     }, whole
 
 
-def _said(results: Calibration) -> dict:
+def _numbers(results: Calibration) -> dict:
     return {
         "values": results.values,
         "deviations": results.deviations,
@@ -127,11 +137,68 @@ def on_device(seed: int, progress: Progress) -> dict:
     return {"mirrored": results.mirrored == mirrored, "off": off, "in_sd": in_sd, "rms_pixels": results.rms}
 
 
+class Spots(NamedTuple):
+    """Geometry that determines the spots of point sources, mm; the tilt is about y, in radians."""
+
+    centers: np.ndarray
+    places: np.ndarray
+    plate: float
+    tilt: float = 0.0
+
+
+def spots_of(device: Spots, seen: np.ndarray, distance: float, rotation: float, *shift: float) -> np.ndarray:
+    """Spots `(source, lens)` of the lenses `seen`, with the fitted geometry."""
+    cos, sin = np.cos(rotation), np.sin(rotation)
+    centers = device.centers @ np.array([[cos, sin], [-sin, cos]]) + shift
+    v = distance + centers[:, :1] * np.tan(device.tilt)
+    ends = [chief_ray(centers, place[:2], v / (place[2] + device.plate)) for place in device.places]
+    return np.concatenate([end[lenses] for end, lenses in zip(ends, seen, strict=True)])
+
+
+def moved(which: int | slice, axis: int, by: float) -> np.ndarray:
+    """Source positions, some of them displaced along x, y or z, mm."""
+    places = SOURCES.copy()
+    places[which, axis] += by
+    return places
+
+
+def mistakes() -> list[tuple[str, float, float]]:
+    """Return for each mistake its name, the residual in pixels RMS, and the error of the sensor distance in um."""
+    design = geomscope()
+    v, pixel = design.imaging.sensor_distance_mm, design.sensor.pixel_pitch_um / 1000
+    plate = design.array.substrate_thickness_mm / design.refractive_index
+    believed = Spots(np.array(design.array.centers_mm), SOURCES, plate)
+    seen = np.hypot(*(believed.centers[None] - SOURCES[:, None, :2]).transpose(2, 0, 1)) < REACH
+    rng = np.random.default_rng(0)
+    wrong = {
+        "nothing": believed,
+        "one depth, 50 um": believed._replace(places=moved(0, 2, 0.05)),
+        "all depths, 200 um": believed._replace(places=moved(slice(None), 2, 0.2)),
+        "one place, 20 um sideways": believed._replace(places=moved(2, 0, 0.02)),
+        "thickness, a fifth": believed._replace(plate=1.2 * plate),
+        "tilt, 0.1 degrees": believed._replace(tilt=np.radians(0.1)),
+        "tilt, 0.5 degrees": believed._replace(tilt=np.radians(0.5)),
+        "each centre, 1 um": believed._replace(centers=rng.normal(believed.centers, 0.001)),
+        "each centre, 3 um": believed._replace(centers=rng.normal(believed.centers, 0.003)),
+        "all centres, 0.2 %": believed._replace(centers=1.002 * believed.centers),
+        "two captures swapped": believed._replace(places=SOURCES[[3, 1, 2, 0]]),
+    }
+    rows = []
+    for name, actual in wrong.items():
+        true = spots_of(actual, seen, v, 0.0, 0.0, 0.0)
+        fit = least_squares(lambda x, true=true: (spots_of(believed, seen, *x) - true).ravel() / pixel, [v, 0, 0, 0])
+        rms = np.sqrt((fit.fun.reshape(-1, 2) ** 2).sum(1).mean())
+        rows.append((name, float(rms), float(1000 * (fit.x[0] - v))))
+    return rows
+
+
 def run(data: Path | None, devices: int, *, progress: Progress) -> tuple[dict, Calibration | None]:
     """Return the content of `calibration.json`, and the calibration from the captures."""
     captures, whole = on_captures(data, progress) if data else ({}, None)
     results = {seed: on_device(seed, progress) for seed in progress.track(range(devices), "Devices")}
-    return {"captures": captures, "devices": results}, whole
+    keys = ("mistake", "rms_pixels", "sensor_distance_um")
+    wrong = [dict(zip(keys, row, strict=True)) for row in mistakes()]
+    return {"captures": captures, "devices": results, "mistakes": wrong}, whole
 
 
 def report(data: Path | None, devices: int, progress: Progress) -> Report:
@@ -144,12 +211,14 @@ def report(data: Path | None, devices: int, progress: Progress) -> Report:
         within = f"{np.mean(np.abs(in_sd) < 3):.0%}"
         rows.append([name, f"{np.median(off):.2g}", f"{off.max():.2g}", within, f"{in_sd.std():.2f}"])
     right = sum(each["mirrored"] for each in results["devices"].values())
-    text = f"# Calibration\n\n{markdown_table(columns, rows)}\n\nMirrored or not: {right} of {devices} right.\n"
-    text += f"\n```\n{json.dumps(results['captures'], indent=2)}\n```\n"
+    head = ("what is wrong", "pixels RMS", "sensor distance, off by um")
+    wrong = [[name, f"{rms:.2g}", f"{off:.2g}"] for name, rms, off in map(dict.values, results["mistakes"])]
+    text = f"# Calibration\n\n{markdown_table(columns, rows)}\n\nMirrored or not: {right} of {devices} right.\n\n"
+    text += f"{markdown_table(head, wrong)}\n\n```\n{json.dumps(results['captures'], indent=2)}\n```\n"
     files: dict[str, dict | str | Figure] = {"calibration.json": results, "calibration.md": text}
     if whole:
         files["calibration.png"] = plot_residuals(whole)
-    return Report(files, [table(columns, rows), text])
+    return Report(files, [table(columns, rows), table(head, wrong), text])
 
 
 if __name__ == "__main__":

@@ -21,15 +21,16 @@ from cycler import cycler
 from matplotlib.figure import Figure
 from rich.console import Console, RenderableType
 from rich.table import Table
+from skimage.feature import peak_local_max
 
-from gs_jax import Imager, Sensor
-from gs_jax.apps.pictures import PALETTE
+from gs_jax import Grid, Imager, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.lenses import EACH
+from gs_jax.pictures import PALETTE
 
 # Designs that only experiments use.
 DESIGNS = Path(__file__).parent / "designs"
@@ -148,6 +149,12 @@ def design_of(data: Path | None) -> Design:
 def points_of(data: Path, scene: str) -> np.ndarray:
     """Points `(x, y, z, flux)` of a ray-traced scene, mm."""
     return np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])
+
+
+def local_maxima(volume: np.ndarray, grid: Grid, **options) -> np.ndarray:
+    """Peaks `(x, y, z, value)`, mm, by scikit-image's `peak_local_max` with these options."""
+    voxels = peak_local_max(volume, exclude_border=False, **options)
+    return np.column_stack([grid.to_mm(voxels), volume[tuple(voxels.T)]])
 
 
 def cropped(imager: Imager, pixels: int, reach: float) -> Imager:

@@ -28,9 +28,7 @@ import numpy as np
 from jaxtyping import Float32, Num
 from matplotlib.figure import Figure
 
-from experiments.common import Report, main, points_of
-from experiments.phantoms import snowflake
-from experiments.profiles import local_maxima
+from experiments.common import Report, local_maxima, main, points_of
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
 from gs_jax import Grid, Imager, Surface, Unrolled, forward_residual

@@ -18,17 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import (
-    depth_scaling,
-    fig3_resolution,
-    fig4_suppression,
-    fig5_fwhm_depth,
-    fig6_usaf,
-    fig7_beads,
-    fig8_snowflake,
-    optics_check,
-    table1,
-)
+from experiments import fig3_resolution, fig4_suppression, fig6_usaf, fig8_snowflake, optics_check, table1
 from experiments.backprojection_speed import Job, race
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax.apps import benchmark_report as benchmark
@@ -59,8 +49,8 @@ _SIDES = (32, 56, 100, 212)
 _EXPONENTS = {"backproject": 0.5, "richardson-lucy, dense": 1.0, "admm, dense": 1.0}
 
 
-def _met(results: bool, why: str) -> str:
-    return "yes" if results else f"no: {why}"
+def _met(met: bool, why: str) -> str:
+    return "yes" if met else f"no: {why}"
 
 
 def _is_within(ours: str, paper: str) -> bool:
@@ -72,43 +62,28 @@ def _is_within(ours: str, paper: str) -> bool:
 
 
 def table_1(data: Path | None, progress: Progress) -> Page:
-    rows = table1.run()["table"]
     plain = lambda text: text.strip("~").split(" (")[0]
-    same = lambda row: _is_within(plain(row["focused: v = 5.8 mm"]), plain(row["paper"]))
-    claims = [
-        Claim(
-            "Table 1",
-            row["what"],
-            row["paper"],
-            row["focused: v = 5.8 mm"],
-            "yes" if same(row) else f"differs: {row['why']}",
-        )
-        for row in rows
-        if row["paper"] != "-"
-    ]
-    return Page({}, claims)
+    claims = []
+    for row in table1.run()["table"]:
+        what, paper, ours = row["what"], row["paper"], row["focused: v = 5.8 mm"]
+        same = _is_within(plain(ours), plain(paper))
+        claims.append(Claim("Table 1", what, paper, ours, "yes" if same else f"differs: {row['why']}"))
+    return Page({}, [claim for claim in claims if claim.paper != "-"])
 
 
 def equation_1(data: Path | None, progress: Progress) -> Page:
-    results = depth_scaling.run(design_of(data), data, progress=progress)
-    rows = [row for each in results.values() for row in each]
+    results = optics_check.scales(design_of(data), data, progress=progress)
+    rows = [row for lines in results.values() for row in lines]
     off = max(abs(row["s_z"] / row["by_eq_1"] - 1) for row in rows)
     z, s = np.array([(row["depth_mm"], row["by_eq_1"]) for row in rows]).T
     bent = np.abs(np.polynomial.Polynomial.fit(z, s, 1)(z) - s).max() / np.ptp(s)
-    why = "cores of spots are off their chief rays; calibration accounts for it"
+    met = _met(off < 1e-3, "cores of spots are off their chief rays; calibration accounts for it")
+    straight, bend = _met(bent < 0.01, "a hyperbola"), f"{100 * bent:.0f} % of its range off a line"
     claims = [
-        Claim(
-            "Eq. (1)", "scale of the pattern, s_z", "(z + v) / z", f"within {100 * off:.2f} %", _met(off < 1e-3, why)
-        ),
-        Claim(
-            "Eq. (1)",
-            "s_z with depth, 18 to 26 mm",
-            "linear",
-            f"{100 * bent:.0f} % of its range off a line",
-            _met(bent < 0.01, "a hyperbola"),
-        ),
+        Claim("Eq. (1)", "scale of the pattern, s_z", "(z + v) / z", f"within {100 * off:.2f} %", met),
+        Claim("Eq. (1)", "s_z with depth, 18 to 26 mm", "linear", bend, straight),
     ]
-    return Page({"depth_scaling.png": depth_scaling.picture(results)}, claims)
+    return Page({"depth_scaling.png": optics_check.picture_of_scales(results)}, claims)
 
 
 def strehl_ratio(data: Path | None, progress: Progress) -> Page:
@@ -118,26 +93,21 @@ def strehl_ratio(data: Path | None, progress: Progress) -> Page:
     least = min(row["wavefront_rms_waves"] for row in rows)
     off = max(abs(row["strehl"] - row["strehl_optiland"]) for row in rows)
     by_eq9 = [np.exp(-((2 * np.pi * row["wavefront_rms_waves"]) ** 2)) for row in rows]
-    worst = max(abs(row["strehl"] - each) for row, each in zip(rows, by_eq9, strict=True))
-    claims = [
-        Claim(
-            "Eq. (9)",
-            "Strehl ratio against field",
-            "exp(-(2 pi w)^2) of third-order w",
-            f"that of the PSF agrees with Optiland's rays within {off:.2f}, and is up to {worst:.2f} off Eq. (9)",
-            _met(worst < 0.02, f"Eq. (9) holds below 0.1 waves, the lens has {least:.1f} at least"),
-        )
-    ]
-    return Page({"strehl.png": optics_check.curves(results)}, claims)
+    worst = max(abs(row["strehl"] - ratio) for row, ratio in zip(rows, by_eq9, strict=True))
+    ours = f"that of the PSF agrees with Optiland's rays within {off:.2f}, and is up to {worst:.2f} off Eq. (9)"
+    met = _met(worst < 0.02, f"Eq. (9) holds below 0.1 waves, the lens has {least:.1f} at least")
+    claim = Claim("Eq. (9)", "Strehl ratio against field", "exp(-(2 pi w)^2) of third-order w", ours, met)
+    return Page({"strehl.png": optics_check.curves(results)}, [claim])
 
 
 def figure_3(data: Path | None, progress: Progress) -> Page:
     results = fig3_resolution.run(design_of(data), data, progress=progress)
     best = results.get("ray-traced", results["gs_jax"])
-    claim = lambda what, paper, key, form: Claim(
-        "Fig. 3", what, paper, " / ".join(format(each[key], form) for each in results.values()),
-        _met(best[key] <= fig3_resolution.BARS[key], "wider"),
-    )  # fmt: skip
+
+    def claim(what: str, paper: str, key: str, form: str) -> Claim:
+        ours = " / ".join(format(result[key], form) for result in results.values())
+        return Claim("Fig. 3", what, paper, ours, _met(best[key] <= fig3_resolution.BARS[key], "wider"))
+
     sources = " / ".join(results)
     claims = [
         claim(f"a point at 20 mm: lateral FWHM, um ({sources})", "~40", "lateral_fwhm_um", ".0f"),
@@ -150,55 +120,54 @@ def figure_3(data: Path | None, progress: Progress) -> Page:
 
 def figure_4(data: Path | None, progress: Progress) -> Page:
     results = list(fig4_suppression.run(design_of(data), data, progress=progress).values())[-1]
-    f1 = lambda method: results["scores"][method]["f1"]
-    plain, best = f1("the paper's clustering"), f1("clustering, the best")
-    said = f"F1 {plain:.2f}, with the best of thresholds {best:.2f}"
+    f1 = {method: score.get("f1") for method, score in results["scores"].items()}
+    plain, best = f1["the paper's clustering"], f1["clustering, the best"]
+    ours = f"F1 {plain:.2f}, with the best of thresholds {best:.2f}"
+    met = _met(best > 0.95, "light of other lenses and haze exceed its thresholds")
     claims = [
-        Claim("Fig. 4A", "120 points, 18 to 22 mm, by clustering", "faithfully reconstructed", said,
-              _met(best > 0.95, "light of other lenses and haze exceed its thresholds")),
-        Claim("Fig. 4A", "the same by find_points", "-", f"F1 {f1('find_points'):.3f}", "ours"),
-    ]  # fmt: skip
+        Claim("Fig. 4A", "120 points, 18 to 22 mm, by clustering", "faithfully reconstructed", ours, met),
+        Claim("Fig. 4A", "the same by find_points", "-", f"F1 {f1['find_points']:.3f}", "ours"),
+    ]
     return Page({"fig4.png": fig4_suppression.picture(results)}, claims)
 
 
 def figure_5(data: Path | None, progress: Progress) -> Page:
-    results = fig5_fwhm_depth.run(design_of(data), data, depths=tuple(np.arange(17.0, 24.1, 1.0)), progress=progress)
-    rows = results["gs_jax"]
+    depths = tuple(np.arange(17.0, 24.1, 1.0))
+    results = fig3_resolution.over_depth(design_of(data), data, depths, progress=progress)
     claims = []
-    for key, bar, what in (("lateral_fwhm_um", 40, "lateral"), ("axial_fwhm_um", 300, "axial")):
-        within = [row["depth_mm"] for row in rows if row[key] <= bar]
-        said = f"within {bar} um at {', '.join(f'{z:g}' for z in within)} mm"
-        stable = len(within) > 5
-        why = "the sensor distance is the best one for 20 mm; sharper there"
-        claims.append(Claim("Fig. 5", f"{what} FWHM over ~5 mm of depth", "stable", said, _met(stable, why)))
-    return Page({"fig5.png": fig5_fwhm_depth.picture(results)}, claims)
+    for what in ("lateral", "axial"):
+        bar = fig3_resolution.BARS[f"{what}_fwhm_um"]
+        within = [row["depth_mm"] for row in results["gs_jax"] if row[f"{what}_fwhm_um"] <= bar]
+        ours = f"within {bar} um at {', '.join(f'{z:g}' for z in within)} mm"
+        met = _met(len(within) > 5, "the sensor distance is the best one for 20 mm; sharper there")
+        claims.append(Claim("Fig. 5", f"{what} FWHM over ~5 mm of depth", "stable", ours, met))
+    return Page({"fig5.png": fig3_resolution.picture_over_depth(results)}, claims)
 
 
 def figure_6(data: Path | None, progress: Progress) -> Page:
     results = fig6_usaf.run(design_of(data), progress=progress)
     rows = fig6_usaf.numbers(results)
     right = sum(row["sharpest_mm"] == row["target_mm"] for row in rows)
-    first = rows[0]
-    both = min(first["vertical"], first["horizontal"])
+    both = min(rows[0]["vertical"], rows[0]["horizontal"])
+    sharp, resolved = _met(right == len(rows), "another is"), _met(both >= fig6_usaf.RESOLVED, "contrast below 0.1")
+    finest = "; ".join(f"{row['target_mm']:g} mm: {row['finest']}" for row in rows)
     claims = [
-        Claim("Fig. 6", "the plane of the target is the sharpest", "at six depths", f"at {right} of {len(rows)}",
-              _met(right == len(rows), "another plane is sharper")),
-        Claim("Fig. 6", "group 3, element 2 at 18 mm", "clearly resolved", f"contrast {both:.2f}",
-              _met(both >= fig6_usaf.RESOLVED, "contrast below 0.1")),
-        Claim("Fig. 6", "finest resolved lines, by depth", "-",
-              "; ".join(f"{row['target_mm']:g} mm: {row['finest']}" for row in rows), "ours"),
-    ]  # fmt: skip
+        Claim(
+            "Fig. 6", "the plane of the target is the sharpest", "at six depths", f"at {right} of {len(rows)}", sharp
+        ),
+        Claim("Fig. 6", "group 3, element 2 at 18 mm", "clearly resolved", f"contrast {both:.2f}", resolved),
+        Claim("Fig. 6", "finest resolved lines, by depth", "-", finest, "ours"),
+    ]
     return Page({"fig6.png": fig6_usaf.picture(results)}, claims)
 
 
 def figure_7(data: Path | None, progress: Progress) -> Page:
-    results = fig7_beads.run(design_of(data), data, progress=progress)
+    results = fig4_suppression.find_beads(design_of(data), data, progress=progress)
     claims = []
-    for name, result in results.items():
-        score = result["scores"]
-        said = f"{score['found']} of {score['points']}, F1 {score['f1']:.3f}, {score['axial_rmse_um']:.0f} um axially"
-        claims.append(Claim("Fig. 7", name, "resolved at different depths", said, _met(score["f1"] > 0.95, "missed")))
-    return Page({"fig7.png": fig7_beads.picture(results)}, claims)
+    for name, score in ((name, result["scores"]) for name, result in results.items()):
+        ours = f"{score['found']} of {score['points']}, F1 {score['f1']:.3f}, {score['axial_rmse_um']:.0f} um axially"
+        claims.append(Claim("Fig. 7", name, "resolved at different depths", ours, _met(score["f1"] > 0.95, "missed")))
+    return Page({"fig7.png": fig4_suppression.picture_of_beads(results)}, claims)
 
 
 def figure_8(data: Path | None, progress: Progress) -> Page:
@@ -206,10 +175,9 @@ def figure_8(data: Path | None, progress: Progress) -> Page:
     pictures, claims = {}, []
     for name, scene in scenes.items():
         psnr = {method: score["psnr_db"] for method, score in scene["scores"].items()}
-        said = ", ".join(f"{psnr[m]:.1f} dB ({m})" for m in ("all zero", "back-projection", *fig8_snowflake.NETWORKS))
+        ours = ", ".join(f"{psnr[m]:.1f} dB ({m})" for m in ("all zero", "back-projection", *fig8_snowflake.NETWORKS))
         better = psnr["paper's network"] > max(psnr["all zero"], psnr["back-projection"])
-        claim = Claim("Figs. 4B, 8", name, "its network recovers the object", said, _met(better, "ours does"))
-        claims.append(claim)
+        claims.append(Claim("Figs. 4B, 8", name, "its network recovers the object", ours, _met(better, "ours does")))
         shown = (18.0,) if "USAF" in name else (18.0, 20.0, 22.0)
         file = f"fig8_{name.split(',')[0].lower().replace(' ', '_')}_{name.split()[-1]}.png"
         pictures[file] = fig8_snowflake.picture(scene, shown, upward="ray-traced" in name)
@@ -218,54 +186,28 @@ def figure_8(data: Path | None, progress: Progress) -> Page:
 
 def figure_9(data: Path | None, progress: Progress) -> Page:
     with progress.step("Back-projection at the paper's full scale"):
-        ours = race(Job(), ["gs_jax"], 5, {})["contestants"]["gs_jax"]["median_s"]
+        seconds = race(Job(), ["gs_jax"], 5, {})["contestants"]["gs_jax"]["median_s"]
     records, _ = run_benchmark(_SIDES, progress=progress)
-    exponents = time_exponents(records)
+    time, rate = f"{1000 * seconds:.0f} ms", f"{1 / seconds:.0f} volumes a second"
+    fast, live = _met(seconds < 18, "slower"), _met(1 / seconds > 20, "below 20 a second")
     claims = [
-        Claim(
-            "Fig. 8",
-            "13 depths, 4e6 voxels, 1e14 pairs",
-            "18 s on 8 threads",
-            f"{1000 * ours:.0f} ms",
-            _met(ours < 18, "slower"),
-        ),
-        Claim(
-            "Fig. 9",
-            "speed",
-            "close to video rate some day",
-            f"{1 / ours:.0f} volumes a second",
-            _met(1 / ours > 20, "below 20 a second"),
-        ),
+        Claim("Fig. 8", "13 depths, 4e6 voxels, 1e14 pairs", "18 s on 8 threads", time, fast),
+        Claim("Fig. 9", "speed", "close to video rate some day", rate, live),
     ]
+    exponents = time_exponents(records)
     for method, paper in _EXPONENTS.items():
-        if method in exponents:
-            met = exponents[method] < paper if method == "backproject" else abs(exponents[method] - paper) < 0.2
-            why = "small matrices fit the cache"
-            said = f"{exponents[method]:.2f}"
-            claims.append(
-                Claim(
-                    "Fig. 9A",
-                    f"exponent of time in pairs, {method}",
-                    f"{'< ' if paper < 1 else ''}{paper:g}",
-                    said,
-                    _met(met, why),
-                )
-            )
+        if (ours := exponents.get(method)) is not None:
+            met = _met(ours < paper if paper < 1 else abs(ours - paper) < 0.2, "small matrices fit the cache")
+            claim = f"{'< ' if paper < 1 else ''}{paper:g}"
+            claims.append(Claim("Fig. 9A", f"exponent of time in pairs, {method}", claim, f"{ours:.2f}", met))
     most = max(r["pairs"] for r in records)
-    mean = lambda method: statistics.fmean(
-        [r["psnr_db"] for r in records if r["method"] == method and r["pairs"] == most]
-    )
-    said = ", ".join(f"{mean(m):.1f} dB ({m})" for m in ("backproject + clusters", "admm", "richardson-lucy", "fista"))
-    near = mean("backproject + clusters") > min(mean("admm"), mean("richardson-lucy")) - 1
-    claims.append(
-        Claim(
-            "Fig. 9B-D",
-            f"clustering at {most:.0e} pairs",
-            "approaches the solvers",
-            said,
-            _met(near, "more than 1 dB below the lesser of both"),
-        )
-    )
+    largest = lambda method: [r["psnr_db"] for r in records if r["method"] == method and r["pairs"] == most]
+    names = ("backproject + clusters", "admm", "richardson-lucy", "fista")
+    mean = {name: statistics.fmean(largest(name)) for name in names}
+    ours = ", ".join(f"{value:.1f} dB ({name})" for name, value in mean.items())
+    near = mean["backproject + clusters"] > min(mean["admm"], mean["richardson-lucy"]) - 1
+    met = _met(near, "more than 1 dB below the lesser of both")
+    claims.append(Claim("Fig. 9B-D", f"clustering at {most:.0e} pairs", "approaches the solvers", ours, met))
     return Page({"fig9.png": benchmark.picture(records)}, claims)
 
 

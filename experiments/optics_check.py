@@ -5,12 +5,18 @@ facing the object. The script compares landing points and optical paths, and the
 and Strehl ratio against field and depth, with third-order theory beside them. With a folder of ray-traced captures, it
 compares the spots of each lens for a single point with our PSF in position, size and brightness.
 
+Eqs. (1) and (3): the images of a point at depth z are the layout of the lenses scaled by `s_z = (z' + v) / z'`, and
+each lens magnifies by `M_z = s_z - 1`; z' is the reduced depth. The scale is measured with the layout alone: spots in
+captures of a point on the axis are matched with the lenses, and a line through spot against lens positions is fitted.
+The paper says that s_z is constant over the field and "scales linearly with depth".
+
     python -m experiments.optics_check [DATA] [--out DIR]
 
 DATA holds `P1.toml`, `P2.toml`, `P1_a.tif`, `P2_a.tif`, `P1_i_*.tif` and the scenes' `*.json`.
 """
 
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,10 +30,12 @@ from rich.json import JSON
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
+from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of, table
+from experiments.ray_tracer import traced
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
-from gs_jax.design.design import read_design
+from gs_jax.calibration.spots import find_spots
+from gs_jax.design.design import Design, read_design
 from gs_jax.geometry import envelope
 from gs_jax.io.captures import read_capture
 from gs_jax.layers import layers_in_front, object_index
@@ -43,6 +51,9 @@ WAVELENGTH = 520e-6
 # of 3 mm.
 RADIUS = 0.65
 FIELDS, DEPTHS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0), (18.0, 19.0, 20.0, 21.0, 22.0, 23.0)
+SCALED = (18.0, 19.0, 20.0, 21.0, 22.0, 23.0, 24.0, 26.0)
+# A spot matches a lens within this distance of its position at a scale of 1.3, mm: half of the smallest pitch.
+_ROUGHLY, _NEAR = 1.3, 0.45
 SPOTS = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
 SHAPES: dict[str, dict] = {
     "plano side in front, k = -2": {"conic_constant": -2.0},
@@ -213,7 +224,6 @@ def spots(data: Path, scene: str, design: str = "P1", half: int = 64, reach: flo
                 "light": float(window.sum()),
                 "capture": _measures(window, offset),
                 **{name: _measures(spot, offset) for name, spot in ours.items()},
-                "pictures": [window / window.sum(), ours["rays"], ours["diffraction"]],
             }
         )
     return rows
@@ -324,16 +334,63 @@ def curves(result: dict) -> Figure:
     return figure
 
 
-def gallery(rows: list[dict], count: int = 5) -> Figure:
-    """Plot spots from the nearest lens outward: capture, rays, diffraction."""
-    ordered = sorted(rows, key=lambda row: row["field_mm"])
-    rows = [ordered[round(i)] for i in np.linspace(0, len(rows) - 1, count)]
-    figure = Figure(figsize=(2.2 * count, 6.8), dpi=90, layout="constrained")
-    for column, row in enumerate(rows):
-        for line, (name, picture) in enumerate(zip(("capture", "rays", "diffraction"), row["pictures"], strict=True)):
-            axis = figure.add_subplot(3, count, line * count + column + 1)
-            axis.imshow(np.sqrt(np.maximum(np.asarray(picture), 0)), cmap="magma")
-            axis.set(xticks=[], yticks=[], title=f"{name}, {row['field_mm']:.1f} mm" if line == 0 else name)
+def scales(
+    design: Design, data: Path | None, *, depths: Sequence[float] = SCALED, rays: int = 20_000, progress: Progress
+) -> dict[str, list[dict]]:
+    """Return the scale by source and depth, its value by Eq. (1), and the residuals of the line."""
+    imager = design.imager()
+    point = lambda depth: np.array([[0.0, 0.0, depth, 1e6]])
+    results = {
+        "our tracer": [
+            scale_of(traced(point(depth), imager, rays), imager, depth) for depth in progress.track(depths, "Tracing")
+        ]
+    }
+    if data is not None:
+        captured = lambda name: read_capture(data / f"P1_{name}.tif", imager.sensor.shape).astype(np.float64)
+        names = sorted(path.stem.removeprefix("P1_") for path in data.glob("P1_i_*_c.tif"))
+        results["another group's"] = [scale_of(captured(n), imager, float(points_of(data, n)[0, 2])) for n in names]
+    return results
+
+
+def scale_of(image: np.ndarray, imager: Imager, depth: float) -> dict:
+    """Measure the scale in a capture of a point on the axis."""
+    seen, scale = imager.field_radius, _ROUGHLY
+    centers = np.asarray(imager.centers, np.float64)
+    centers = centers[np.hypot(*centers.T) < float(seen)]
+    positions = np.asarray(imager.sensor.to_mm(find_spots(image, 2 * len(centers))))
+    tree: Any = KDTree(positions)
+    # Match twice; the second time with the positions predicted by the first fit.
+    for reach in (_NEAR, _NEAR / 10):
+        distance, nearest = tree.query(scale * centers)
+        sure = distance < reach
+        scale = float((centers[sure] * positions[nearest[sure]]).sum() / (centers[sure] ** 2).sum())
+    off = positions[nearest[sure]] - scale * centers[sure]
+    by_eq1 = 1 + float(imager.magnification(depth))
+    row = {"depth_mm": depth, "spots": int(sure.sum()), "s_z": scale, "by_eq_1": by_eq1}
+    thin = 1 + float(imager.sensor_distance) / depth
+    return row | {"plate_left_out": thin, "rms_um": 1000 * float(np.sqrt((off**2).sum(1).mean()))}
+
+
+def picture_of_scales(results: dict[str, list[dict]]) -> Figure:
+    """Plot the scale against depth, and its difference from Eq. (1)."""
+    figure = Figure(figsize=(9.5, 3.8), dpi=100, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    ours = next(iter(results.values()))
+    column = lambda rows, key: np.array([row[key] for row in rows])
+    depths = column(ours, "depth_mm")
+    left.plot(depths, column(ours, "by_eq_1"), "-", color="black", label="Eq. (1), the plate as air")
+    left.plot(depths, column(ours, "plate_left_out"), ":", color="black", label="Eq. (1), the plate left out")
+    line = np.polynomial.Polynomial.fit(depths, column(ours, "by_eq_1"), 1)(depths)
+    right.plot(depths, 1000 * (line - column(ours, "by_eq_1")), "--", color="0.5", label='a line ("scales linearly")')
+    for (source, rows), marker in zip(results.items(), "os", strict=False):
+        left.plot(column(rows, "depth_mm"), column(rows, "s_z"), marker, label=f"measured, {source}")
+        error = 1000 * (column(rows, "s_z") - column(rows, "by_eq_1"))
+        right.plot(column(rows, "depth_mm"), error, marker + "-", label=f"measured, {source}")
+    right.axhline(0, color="black", lw=0.8)
+    left.set(xlabel="depth, mm", ylabel="scale $s_z$")
+    right.set(xlabel="depth, mm", ylabel="scale less Eq. (1), thousandths")
+    left.legend()
+    right.legend()
     return figure
 
 
@@ -359,12 +416,16 @@ def report(data: Path | None, progress: Progress) -> Report:
     shaped = [[name, *(f"{row[key]:.3g}" for key in _OF_SHAPES)] for name, row in others]
     broken = [[f"{number:.3g}" for number in row.values()] for row in result["breakdown"]]
     limits = ("pupil radius, mm", "wavefront error, waves RMS", "Strehl ratio of the PSF", "Eq. (9)")
-    files: dict[str, Any] = {"curves.png": curves(result), "result.json": result}
     shown = [table(columns, rows), table(("lens", *_OF_SHAPES.values()), shaped), table(limits, broken)]
+    result["scales"] = scaled = scales(design_of(data), data, progress=progress)
+    columns = ("captures", "depth, mm", "spots", "s_z", "by Eq. (1)", "without the plate", "off the line, um RMS")
+    rows = [[source, *(f"{x:.5g}" for x in row.values())] for source, lines in scaled.items() for row in lines]
+    shown.append(table(columns, rows))
+    pictures = {"curves.png": curves(result), "depth_scaling.png": picture_of_scales(scaled)}
+    files: dict[str, Any] = pictures | {"result.json": result}
     if data is not None:
         results = {f"P1_{scene}": spots(data, scene) for scene in progress.track(SPOTS, "Captures")}
         results["P2_a"] = spots(data, "a", "P2")
-        files |= {f"spots_{name}.png": gallery(results[name]) for name in ("P1_i_20_c", "P1_i_18_px", "P2_a")}
         result["captures"] = {name: summary(rows) for name, rows in results.items()}
         return Report(files, [*shown, JSON.from_data(result["captures"])])
     return Report(files, shown)

@@ -21,8 +21,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.common import OPTIONAL_PATH, Report, main, table
-from experiments.profiles import local_maxima
+from experiments.common import OPTIONAL_PATH, Report, local_maxima, main, table
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design

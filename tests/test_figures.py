@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import fig3_resolution, fig5_fwhm_depth, forward_model, table1
+from experiments import fig3_resolution, forward_model, table1
 from experiments.backprojection_speed import Job, inputs
-from experiments.profiles import dip, fwhm, local_maxima
+from experiments.common import local_maxima
+from experiments.fig3_resolution import dip, fwhm
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
@@ -82,7 +83,7 @@ def test_points_are_as_sharp_as_the_paper_says_simulated_and_ray_traced():
     needs("geomscope/centers.csv")
     data = needs("oracle/dev/P1.toml").parent
     found = fig3_resolution.run(read_design(data / "P1.toml"), data, progress=Progress())
-    for result in fig3_resolution.numbers(found).values():
+    for result in found.values():
         for key, bar in fig3_resolution.BARS.items():
             assert result[key] <= bar, (key, result)
     fig3_resolution.picture(found)
@@ -92,9 +93,9 @@ def test_points_are_as_sharp_as_the_paper_says_simulated_and_ray_traced():
 def test_the_width_against_depth():
     needs("geomscope/centers.csv")
     data = needs("oracle/dev/P1.toml").parent
-    found = fig5_fwhm_depth.run(read_design(data / "P1.toml"), data, depths=(20.0,), progress=Progress())
+    found = fig3_resolution.over_depth(read_design(data / "P1.toml"), data, (20.0,), progress=Progress())
     middle = [row for rows in found.values() for row in rows if row["depth_mm"] == 20]
     assert len(middle) == 2
     for row in middle:
         assert row["lateral_fwhm_um"] <= 40 and row["axial_fwhm_um"] <= 300
-    fig5_fwhm_depth.picture(found)
+    fig3_resolution.picture_over_depth(found)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from experiments import depth_scaling, fig6_usaf, gallery
+from experiments import fig6_usaf, gallery, optics_check
 from experiments.ray_tracer import traced
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
@@ -48,13 +48,13 @@ def test_planes_of_a_target_and_the_picture():
 
 def test_the_scale_of_a_traced_point_is_that_of_equation_1():
     imager = geomscope().imager()
-    row = depth_scaling.measured(traced(np.array([[0, 0, 20.0, 1e6]]), imager, 4000), imager, 20.0)
+    row = optics_check.scale_of(traced(np.array([[0, 0, 20.0, 1e6]]), imager, 4000), imager, 20.0)
     assert row["spots"] > 8 and row["s_z"] == pytest.approx(
         row["by_eq_1"], rel=2e-3
     )  # cores are beside their chief rays
     # A plate that is left out is noticed.
     assert abs(row["s_z"] / row["plate_left_out"] - 1) > 5e-3
-    assert len(depth_scaling.picture({"ours": [row, row | {"depth_mm": 21.0}]}).axes) == 2
+    assert len(optics_check.picture_of_scales({"ours": [row, row | {"depth_mm": 21.0}]}).axes) == 2
 
 
 def test_the_page_has_a_row_for_each_claim(monkeypatch):

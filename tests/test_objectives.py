@@ -10,7 +10,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.ndimage import uniform_filter
 
-from experiments.profiles import fwhm as profile_width
+from experiments.fig3_resolution import fwhm as profile_width
 from gs_jax import objectives
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.terms import TERMS

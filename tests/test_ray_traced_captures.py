@@ -4,8 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from experiments.common import points_of
-from experiments.profiles import local_maxima
+from experiments.common import local_maxima, points_of
 from experiments.through_layers import on_points, scope_of
 from gs_jax import Grid, localization, read_capture, read_design, reconstruct
 from gs_jax.base.progress import Progress

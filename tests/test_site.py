@@ -14,7 +14,7 @@ import jax
 import pytest
 
 import gs_jax as gs
-from experiments.calibration_errors import run
+from experiments.calibration import mistakes
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.codesign.study import Study
 from gs_jax.design.start import design_keys
@@ -181,7 +181,7 @@ def test_drawings_are_up_to_date(name):
 
 def test_residuals_of_calibration_mistakes():
     """As the laboratory guide lists them, in pixels RMS."""
-    residuals = {name: rms for name, rms, _ in run()}
+    residuals = {name: rms for name, rms, _ in mistakes()}
     listed = {"nothing": 0.0, "each centre, 3 um": 1.2, "tilt, 0.5 degrees": 1.2, "all centres, 0.2 %": 0.8}
     listed |= {"one place, 20 um sideways": 0.5, "one depth, 50 um": 0.3, "all depths, 200 um": 0.2}
     assert {name: round(residuals[name], 1) for name in listed} == listed and residuals["two captures swapped"] > 40
