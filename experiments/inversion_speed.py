@@ -1,41 +1,48 @@
-"""Time the iterative methods at their defaults, and the full forward model, beside another checkout.
+"""Time and memory of the forward models, the iterative methods at their defaults, and three other functions.
 
-The scene has bars of three widths and points at nine depths, and its capture 5120 x 5120 pixels, rendered by the first
-checkout. Each checkout runs in processes of its own, one after the other; the first call of a method is timed apart, as
-it compiles. Processor time varies less than time by the clock where other programs run. "Difference" is the RMS of that
-of the two volumes, over the first one's.
+The scene has bars of three widths and points at nine depths, and its capture 5120 x 5120 pixels, rendered by the full
+model. Each line runs in a process of its own, one after the other; the first call is timed apart, as it compiles.
+Processor time varies less than time by the clock where other programs run.
 
-    python -m experiments.inversion_speed [--before CHECKOUT] [--methods list-rl,richardson-lucy] [--out DIR]
+    python -m experiments.inversion_speed [--methods list-rl,richardson-lucy] [--pixels 5120] [--out DIR]
 
-Writes `inversion_speed.json` and `inversion_speed.md`; with two checkouts four minutes on two cores for the model and
-Richardson-Lucy.
+Writes `inversion_speed.json` and `inversion_speed.md`; about four minutes on two cores.
 """
 
-import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 
+import gs_jax as gs
+from experiments.backprojection_speed import in_new_process
 from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.machine import status_mib
 from gs_jax.base.progress import Progress
+from gs_jax.reconstruction.inverse_problem import prepare_model
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
 
-DEPTHS = np.linspace(18.0, 22.0, 9)
-METHODS = ("list-rl", "richardson-lucy", "unrolled", "fista", "admm")
+DEPTHS = np.linspace(18.0, 22.0, 9).tolist()
+MODELS = ("near", "full")
 # `find_points`, `simulate`, and the network that suppresses haze.
 OTHERS = "others"
-# Later calls of the model; a method takes long, and gets one.
+NAMES = (*MODELS, "list-rl", "richardson-lucy", "unrolled", "fista", "admm", OTHERS)
+# Later calls of the models; a method takes long, and gets one.
 ROUNDS = 3
-HERE = Path(__file__).parents[1]
+COLUMNS = {
+    "first_s": ("first call, s", ".1f"),
+    "clock_s": ("later calls, s", ".2f"),
+    "processor_s": ("processors, s", ".2f"),
+    "memory_mib": ("MiB", ".0f"),
+}
 
 
 def measure(call: Callable[[], Any], rounds: int) -> tuple[dict[str, float], Any]:
@@ -61,16 +68,46 @@ def scene(shape: tuple[int, int, int]) -> np.ndarray:
     return volume
 
 
-def others(scope: Any) -> dict[str, Any]:
-    """Time finding 100 points, imaging three planes, and five slices of the network."""
-    import gs_jax as gs
-    from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+def imager_of(pixels: int) -> gs.Imager:
+    """The built-in microscope with so many pixels in each direction."""
+    scope = gs.geomscope().imager()
+    return eqx.tree_at(lambda i: i.sensor, scope, gs.Sensor((pixels, pixels), scope.sensor.pixel_pitch))
 
-    rng = np.random.default_rng(0)
+
+def of_model(name: str, capture: Path, pixels: int) -> dict[str, Any]:
+    """Time a forward model and its adjoint; the full model renders the capture."""
+    scope = imager_of(pixels)
+    grid = voxel_grid(scope, DEPTHS, None, pixels=PIXELS_PER_VOXEL)
+    began = time.perf_counter()
+    model = prepare_model(scope, grid, name, Progress())
+    results: dict[str, Any] = {f"{name} model: tables": {"first_s": time.perf_counter() - began}}
+    A, volume = gs.ImagingOperator(model.imager, grid, model.optics), scene(grid.volume_shape)
+    forward, adjoint = jax.jit(lambda A, x: A.mv(x)), jax.jit(lambda A, y: A.T.mv(y))
+    results[f"{name} model"], image = measure(lambda: jax.block_until_ready(forward(A, volume)), ROUNDS)
+    results[f"{name} model, adjoint"], _ = measure(lambda: jax.block_until_ready(adjoint(A, image)), ROUNDS)
+    if name == "full":
+        light = np.maximum(np.kron(np.asarray(image), np.ones((model.binning, model.binning))), 0)
+        light = np.pad(light, [(0, pixels - n) for n in light.shape]) * (2000 / light.max())
+        np.save(capture, np.random.default_rng(0).poisson(light).astype(np.float32))
+    return results
+
+
+def of_method(name: str, capture: Path, pixels: int) -> dict[str, Any]:
+    """Time a method on the capture."""
+    scope, image = imager_of(pixels), np.load(capture)
+    grid = voxel_grid(scope, DEPTHS, None, pixels=PIXELS_PER_VOXEL)
+    invert = Reconstructor(scope, grid, METHODS[name](20), progress=Progress())
+    seconds, _ = measure(lambda: invert(image, Progress()), 1)
+    return {name: seconds | {"memory_mib": status_mib("VmHWM")}}
+
+
+def of_others(name: str, capture: Path, pixels: int) -> dict[str, Any]:
+    """Time finding 100 points, imaging three planes, and five slices of the network."""
+    scope, rng = imager_of(pixels), np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-8, 8, (100, 2)), rng.uniform(18, 22, 100), np.ones(100)])
     image = np.asarray(gs.simulate(points, scope))
     counts = rng.poisson(image * (2000 / image.max())).astype(np.float32)
-    fine, three = voxel_grid(scope, DEPTHS.tolist()), voxel_grid(scope, [18.0, 20.0, 22.0], pixels=PIXELS_PER_VOXEL)
+    fine, three = voxel_grid(scope, DEPTHS), voxel_grid(scope, [18.0, 20.0, 22.0], pixels=PIXELS_PER_VOXEL)
     planes = np.zeros(three.volume_shape, np.float32)
     planes[:, 100:200, 100:120] = 1
     slices = rng.random((5, 512, 512)).astype(np.float32)
@@ -82,103 +119,28 @@ def others(scope: Any) -> dict[str, Any]:
     return {name: measure(call, ROUNDS)[0] for name, call in calls.items()}
 
 
-def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
-    """Time the model, which renders the capture, or a method, whose volume goes to the folder."""
-    import equinox as eqx
-    import jax
-
-    import gs_jax as gs
-    from gs_jax.reconstruction.inverse_problem import prepare_model
-    from gs_jax.reconstruction.pipeline import METHODS as BY_NAME, PIXELS_PER_VOXEL, Reconstructor, voxel_grid
-
-    scope = gs.geomscope().imager()
-    scope = eqx.tree_at(lambda i: i.sensor, scope, gs.Sensor((pixels, pixels), scope.sensor.pixel_pitch))
-    if name == OTHERS:
-        return others(scope)
-    grid = voxel_grid(scope, DEPTHS.tolist(), None, pixels=PIXELS_PER_VOXEL)
-    if name == "model":
-        began = time.perf_counter()
-        model = prepare_model(scope, grid, "full", Progress())
-        parts = {"tables": {"first_s": time.perf_counter() - began}}
-        A, volume = gs.ImagingOperator(model.imager, grid, model.optics), scene(grid.volume_shape)
-        forward, adjoint = jax.jit(lambda A, x: A.mv(x)), jax.jit(lambda A, y: A.T.mv(y))
-        parts["forward"], image = measure(lambda: jax.block_until_ready(forward(A, volume)), ROUNDS)
-        parts["adjoint"], _ = measure(lambda: jax.block_until_ready(adjoint(A, image)), ROUNDS)
-        light = np.maximum(np.kron(np.asarray(image), np.ones((model.binning, model.binning))), 0)
-        light = np.pad(light, [(0, pixels - n) for n in light.shape]) * (2000 / light.max())
-        if not (file := folder / "image.npy").exists():
-            np.save(file, np.random.default_rng(0).poisson(light).astype(np.float32))
-        return parts
-    image = np.load(folder / "image.npy")
-    invert = Reconstructor(scope, grid, BY_NAME[name](20), progress=Progress())
-    seconds, volume = measure(lambda: invert(image, Progress()), 1)
-    np.save(folder / "volume.npy", volume)
-    return {name: seconds | {"memory_mib": status_mib("VmHWM")}}
+def run(names: list[str], pixels: int, progress: Progress) -> dict[str, dict[str, float]]:
+    """Seconds and memory by what is timed."""
+    results = {}
+    with tempfile.TemporaryDirectory() as folder:
+        # Methods need the full model's capture.
+        for name in progress.track(sorted({"full", *names}, key=NAMES.index), "Timing"):
+            work = of_model if name in MODELS else of_others if name == OTHERS else of_method
+            results |= in_new_process(work, name, Path(folder) / "image.npy", pixels)
+    return results
 
 
-def in_checkout(checkout: Path, name: str, folder: Path, pixels: int) -> dict[str, Any]:
-    """`work` with the package of a checkout, in a process of its own."""
-    # By its path, as the other checkout may lack this file.
-    code = "import runpy, sys; runpy.run_path(sys.argv[1], run_name='worker')"
-    command = [sys.executable, "-c", code, __file__, name, str(folder), str(pixels)]
-    environment = os.environ | {"PYTHONPATH": str(checkout)}
-    done = subprocess.run(command, cwd=checkout, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def run(checkouts: dict[str, Path], names: list[str], pixels: int, progress: Progress) -> list[dict[str, Any]]:
-    """A row for each part of the model and each method: its name, what each checkout measured, and the difference."""
-    rows = []
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        for name in progress.track(["model", *names], "Timing"):
-            found, volumes = {}, []
-            for label, checkout in checkouts.items():
-                found[label] = in_checkout(checkout, name, folder, pixels)
-                volumes += [np.load(folder / "volume.npy")] if name in METHODS else []
-            parts = next(iter(found.values()))
-            rows += [{"name": part} | {label: each[part] for label, each in found.items()} for part in parts]
-            if len(volumes) == 2:
-                rows[-1]["difference"] = float(np.linalg.norm(volumes[1] - volumes[0]) / np.linalg.norm(volumes[0]))
-    return rows
-
-
-def cells(row: dict[str, Any], labels: list[str]) -> list[str]:
-    """A line of the table."""
-    number = lambda value, digits=2: "" if value is None else f"{value:.{digits}f}"
-    each = [row[label] for label in labels]
-    found = [row["name"]] + [number(one["first_s"]) for one in each]
-    for key in ("clock_s", "processor_s"):
-        values = [one.get(key) for one in each]
-        found += [number(value) for value in values]
-        if len(labels) == 2:
-            found.append(number(None if None in values else values[0] / values[1]))
-    return [*found, *(number(one.get("memory_mib"), 0) for one in each), number(row.get("difference"), 4)]
-
-
-def report(before: Path | None, methods: str, pixels: int, progress: Progress) -> Report:
+def report(methods: str, pixels: int, progress: Progress) -> Report:
     names = methods.split(",")
-    if unknown := [name for name in names if name not in (*METHODS, OTHERS)]:
-        raise InputError(f"--methods must be of {', '.join((*METHODS, OTHERS))}, got {', '.join(unknown)}.")
-    checkouts = ({"before": before.resolve()} if before else {}) | {"now": HERE}
-    rows, labels = run(checkouts, names, pixels, progress), list(checkouts)
-    ratio = ["ratio"] if before else []
-    timed = [[*(f"{what}, s: {label}" for label in labels), *ratio] for what in ("later calls", "processors")]
-    columns = ["", *(f"first call, s: {label}" for label in labels), *timed[0], *timed[1]]
-    columns += [*(f"MiB: {label}" for label in labels), "difference"]
-    lines = [cells(row, labels) for row in rows]
-    files = {"inversion_speed.json": rows, "inversion_speed.md": markdown_table(columns, lines)}
-    return Report(files, [table(columns, lines)])
+    if unknown := [name for name in names if name not in NAMES]:
+        raise InputError(f"--methods must be of {', '.join(NAMES)}, got {', '.join(unknown)}.")
+    results = run(names, pixels, progress)
+    cell = lambda row, key: format(row[key], COLUMNS[key][1]) if key in row else ""
+    rows = [[name, *(cell(row, key) for key in COLUMNS)] for name, row in results.items()]
+    columns = ("", *(title for title, _ in COLUMNS.values()))
+    files = {"inversion_speed.json": results, "inversion_speed.md": markdown_table(columns, rows)}
+    return Report(files, [table(columns, rows)])
 
 
-if __name__ == "worker":
-    print(json.dumps(work(sys.argv[2], Path(sys.argv[3]), int(sys.argv[4]))))
 if __name__ == "__main__":
-    main(
-        report,
-        {
-            "--before": {"type": Path, "metavar": "CHECKOUT"},
-            "--methods": {"default": ",".join(METHODS)},
-            "--pixels": {"type": int, "default": 5120},
-        },
-    )
+    main(report, {"--methods": {"default": ",".join(NAMES)}, "--pixels": {"type": int, "default": 5120}})

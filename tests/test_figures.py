@@ -1,16 +1,13 @@
 """The experiments that reproduce the paper's Table 1 and Figs. 3 and 5."""
 
-import json
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import fig3_resolution, forward_model, table1
-from experiments.backprojection_speed import Job, inputs
+from experiments import fig3_resolution, table1, true_image
 from experiments.common import local_maxima
 from experiments.fig3_resolution import dip, fwhm
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
+from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 
@@ -49,33 +46,11 @@ def test_table_1_has_every_row_of_the_paper():
     assert "| ~300 um |" in table1.markdown(found)
 
 
-def test_the_forward_model_at_toy_size(tmp_path):
-    sizes = [Job(voxels=9, pixels=n, lenses=9, depths=2) for n in (100, 200)]
-    found = forward_model.run({"pixels": sizes}, sizes[0], progress=Progress())
-    models = (forward_model.WHOLE, "near", "full", "two rings")
-    assert set(found["levels"]) == {
-        f"{model}{of}" for model in models for of in ("", ", adjoint", ", Richardson-Lucy step")
-    }
-    assert [row[2] for row in forward_model.bars(found["levels"])] == [">= 2", "", ""]
-    assert [row["pixels"] for row in found["cost"]["pixels"]] == [100, 200]
-    assert 0 < found["zones"]["mean"] < found["zones"]["worst"]
-    forward_model.picture({"cost": {axis: found["cost"]["pixels"] for axis in ("depths", "lenses", "pixels")}})
-    json.dumps(found)
-
-
-def test_whole_images_are_the_same_model():
-    job = Job(voxels=9, pixels=200, lenses=9, depths=2)
-    s, psf = inputs(job), jnp.asarray(np.random.default_rng(0).random((2, 65, 65)), jnp.float32)
-    ours = forward(s.volume, s.imager, s.grid, psf)
-    theirs = forward_model.by_whole_images(s.volume, s.imager, s.grid, psf)
-    np.testing.assert_allclose(ours, theirs, atol=1e-5 * float(theirs.max()))
-
-
 def test_zones_do_not_matter_to_a_wide_flat_field():
     array = MicrolensArray(np.random.default_rng(0).uniform(-5, 5, (60, 2)))
     imager = Imager(array, Sensor((10, 10), 1.0), 5.0, field_radius=200.0)
     # cos^4 is what is left: 1 - 2 r^2 / z^2.
-    assert forward_model.zone_departure(imager, 1000.0, (10.0, 10.0), points=500)["worst"] < 1e-4
+    assert true_image.zone_departure(imager, 1000.0, (10.0, 10.0), points=500)["worst"] < 1e-4
 
 
 @pytest.mark.slow
