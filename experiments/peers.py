@@ -1,158 +1,158 @@
-"""Real captures through diffusers, by our ADMM, scico and LenslessPiCam, side by side.
+"""Deconvolution of real captures by measured PSFs: time, memory and objective, ours, scico's and LenslessPiCam's.
 
 Volume: DiffuserCam's resolution target, at an angle, and 36 measured PSFs, the problem of scico's example
-`diffusercam_tv_admm` (Balke et al., J. Open Source Softw. 7, 4722, 2022). Plane: DiffuserCam's hand at a quarter of its
-size, the problem of `diffusercam.py`; LenslessPiCam 1.0.8 has this one alone, as its convolution keeps the images of
-planes apart instead of summing them. Each code runs in a process of its own, one after the other, and the objective of
-each step's scene is computed for all by the same lines of NumPy.
+`diffusercam_tv_admm` (Balke et al., J. Open Source Softw. 7, 4722, 2022). LenslessPiCam 1.0.8 takes no part, as its
+convolution keeps the images of planes apart instead of summing them. Plane: DiffuserCam's hand, at a quarter of its
+size and in full, with total variation of 1e-4 in ADMM alone. As in Waller Lab's tutorial the mean of the PSF's dark
+corner is subtracted from both images.
 
-    python experiments/peers_deconvolution.py DATA [--scico PYTHON] [--lensless PYTHON] [--out DIR]
+Each code and method runs in a process of its own, the codes in turn; steps on the plane in several rounds, with ratios
+of the same round. The objective of each step's scene is computed for all by the same lines of NumPy.
+
+    python -m experiments.peers DATA [--scico PYTHON] [--lensless PYTHON] [--rounds 3] [--out DIR]
 
 DATA holds the folders `diffusercam` and `diffusercam3d`; PYTHON are those of environments with the peers. Writes
-`peers_deconvolution.json` and `.png`; about ten minutes on two cores.
+`peers.json` and `peers.md`; about fifteen minutes on two cores.
 """
 
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import tifffile
-from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from experiments.diffusercam import TV, read
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 
-# Planes of the stack that the example takes, and the weights of its priors.
+# Planes of the stack that the example takes, the weights of its priors, and the steps of each code.
 PLANES, EXAMPLE_TV, EXAMPLE_L1 = slice(1, 37), 3e-3, 1e-2
-# Objective to which time is measured, of the volume.
-LEVEL = 4.45
-STEPS = {"volume": {"gs_jax": 60, "scico": 25}, "plane": {"gs_jax": 100, "scico": 100, "LenslessPiCam": 100}}
-SHOWN = (4, 11, 18, 25, 32)
+OF_VOLUME = {"gs_jax": 60, "scico": 25}
+METHODS = {"Richardson-Lucy": ("gs_jax",), "FISTA": ("gs_jax", "scico", "LenslessPiCam")}
+METHODS["ADMM"] = METHODS["FISTA"]
+# Weight of the plane's total variation; reductions of its sides, and steps.
+TV, STEPS = 1e-4, {4: 60, 1: 12}
+VOLUME_COLUMNS = ("code", "steps", "s a step", "processor, s", "objective", "least printed", "rises", "memory, MiB")
+STEP_COLUMNS = ("pixels", "method", "code", "ms a step", "over ours", "processor, ms", "memory, MiB", "objective")
 
 
-def volume(folder: Path, factor: int = 1) -> dict[str, np.ndarray | float]:
-    """The example's problem: capture and stack less their minimum over their maximum, each PSF of unit norm.
-
-    With a factor, every so many planes, and pixels averaged over squares.
-    """
+def volume(folder: Path) -> dict[str, np.ndarray | float]:
+    """The example's problem: capture and stack less their minimum over their maximum, each PSF of unit norm."""
     image, stack = (tifffile.imread(folder / f"{name}.tif").astype(np.float32) for name in ("capture", "psf_stack"))
     image, stack = ((a - a.min()) / (a.max() - a.min()) for a in (image, stack))
-    image, stack = (_averaged(a, factor) for a in (image, stack[PLANES][::factor]))
-    stack /= np.linalg.norm(stack, axis=(1, 2), keepdims=True)
+    stack = stack[PLANES] / np.linalg.norm(stack[PLANES], axis=(1, 2), keepdims=True)
     return {"image": image, "stack": stack, "tv": EXAMPLE_TV, "l1": EXAMPLE_L1, "signed": True}
 
 
-def plane(folder: Path, factor: int = 4) -> dict[str, np.ndarray | float]:
-    psf, image = read(folder, factor)
-    return {"image": image, "stack": psf[None], "tv": TV, "l1": 0.0, "signed": False}
-
-
-def _averaged(a: np.ndarray, factor: int) -> np.ndarray:
-    rows, columns = (n // factor for n in a.shape[-2:])
-    a = a[..., : rows * factor, : columns * factor]
-    return a.reshape(*a.shape[:-2], rows, factor, columns, factor).mean((-3, -1))
+def plane(folder: Path, factor: int, tv: float) -> dict[str, np.ndarray | float]:
+    """The hand, averaged over squares; PSF and image of unit norm."""
+    raw = [tifffile.imread(folder / f"{name}.tif").astype(np.float32) for name in ("psf_sample", "rawdata_hand_sample")]
+    dark = raw[0][5:15, 5:15].mean()
+    rows, columns = (n // factor for n in raw[0].shape)
+    small = [(a - dark).reshape(rows, factor, columns, factor).mean((1, 3)) for a in raw]
+    psf, image = (a / np.linalg.norm(a) for a in small)
+    return {"image": image, "stack": psf[None], "tv": tv, "l1": 0.0, "signed": False}
 
 
 def run(problem: dict, pythons: dict[str, str], steps: dict[str, int], progress: Progress) -> dict[str, dict]:
-    """Run each code, or a method of it, on a problem; results by the names in `steps`, as the runs write them."""
-    script = str(Path(__file__).with_name("peers_deconvolution_runs.py"))
-    results = {}
+    """Run each code, or a method of it, on a problem; results by the names in `steps`, as `peers_runs.py` has them."""
+    script, results = str(Path(__file__).with_name("peers_runs.py")), {}
     with tempfile.TemporaryDirectory() as folder:
-        given, found = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        given, output = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(given, **problem)
         for code in [code for code in steps if code.split()[0] in pythons]:
-            python = pythons[code.split()[0]]
             with progress.step(code):
-                command = [python, script, code, str(given), str(found), str(steps[code])]
+                command = [pythons[code.split()[0]], script, code, str(given), str(output), str(steps[code])]
                 done = subprocess.run(command, capture_output=True, text=True)
                 if done.returncode:
                     raise RuntimeError(f"{code}: {done.stderr[-2000:]}")
-                with np.load(found) as arrays:
+                with np.load(output) as arrays:
                     results[code] = {name: arrays[name] for name in arrays.files}
     return results
 
 
-def first_below(values: np.ndarray, level: float) -> int | None:
-    """Index of the first value that is no larger than a level."""
-    (below,) = np.nonzero(values <= level)
-    return int(below[0]) if below.size else None
-
-
-def rows_of(results: dict[str, dict], level: float | None) -> list[dict]:
-    rows = []
-    for code, result in results.items():
-        objectives, seconds = result["objectives"], result["seconds"]
-        row = {
+def volume_rows(results: dict[str, dict]) -> list[dict]:
+    """Steps, time, memory and objective of each code; `rises` counts the steps after which the objective is higher."""
+    return [
+        {
             "code": code,
-            "steps": len(objectives),
-            "s_a_step": float(np.median(np.diff(seconds, prepend=0))),
-            "processor_s_a_step": float(np.median(np.diff(result["processor_seconds"], prepend=0))),
-            "least": float(objectives.min()),
-            "last": float(objectives[-1]),
+            "steps": len(objectives := result["objectives"]),
+            "seconds_a_step": _median_step(result["seconds"]),
+            "processor_seconds_a_step": _median_step(result["processor_seconds"]),
+            "objective": float(objectives.min()),
+            "least_printed": float(np.min(result["printed"])),
             "rises": int((np.diff(objectives) > 1e-6 * objectives[:-1]).sum()),
             "peak_mib": float(result["peak_mib"]),
         }
-        if level is not None:
-            for name, values in (("", objectives), ("printed_", result["printed"])):
-                at = first_below(values, level)
-                row[f"{name}seconds_to_level"] = None if at is None else float(seconds[at])
-            row["least_printed"] = float(np.min(result["printed"]))
-        rows.append(row)
+        for code, result in results.items()
+    ]
+
+
+def step_rows(rounds: Sequence[dict[str, dict]]) -> list[dict]:
+    """Medians of the steps of each code and method, and over rounds; ratios to ours within a round."""
+    rows = []
+    for name in rounds[0]:
+        code, method = name.split(maxsplit=1)
+        results = [results[name] for results in rounds]
+        seconds = [_median_step(result["seconds"]) for result in results]
+        ours = [_median_step(results[f"gs_jax {method}"]["seconds"]) for results in rounds]
+        rows.append(
+            {
+                "method": method,
+                "code": code,
+                "versions": str(results[0]["versions"]),
+                "seconds_a_step": float(np.median(seconds)),
+                "rounds_seconds_a_step": seconds,
+                "over_ours": float(np.median(np.divide(seconds, ours))),
+                "processor_seconds_a_step": float(np.median([_median_step(r["processor_seconds"]) for r in results])),
+                "peak_mib": float(np.median([r["peak_mib"] for r in results])),
+                "objective": float(results[0]["objectives"][-1]),
+            }
+        )
     return rows
 
 
-def picture(of_volume: dict[str, dict], of_plane: dict[str, dict]) -> Figure:
-    """Planes side by side, a code in each row, and the objectives against time."""
-    codes = list(of_plane)
-    shown = [plane for plane in SHOWN if plane < len(of_volume[codes[0]]["planes"])]
-    figure = Figure(figsize=(2.3 * (len(shown) + 1), 2.0 * len(codes) + 3), dpi=90, layout="constrained")
-    top, bottom = (figure.subfigures(2, 1, height_ratios=[2.0 * len(codes), 3.0], squeeze=False)).flat
-    axes = top.subplots(len(codes), len(shown) + 1, squeeze=False)
-    for row, (code, result) in zip(axes, of_volume.items(), strict=False):
-        planes = result["planes"]
-        for axis, number in zip(row, shown, strict=False):
-            axis.imshow(planes[number], cmap="gray", vmin=0, vmax=np.percentile(planes[shown], 99.7))
-            axis.set_title(f"{code}, plane {number + PLANES.start}", fontsize=8)
-    for row, (code, result) in zip(axes, of_plane.items(), strict=True):
-        hand = result["planes"][0]
-        row[-1].imshow(hand, cmap="gray", vmin=0, vmax=np.percentile(hand, 99.9))
-        row[-1].set_title(f"{code}, hand", fontsize=8)
-    for axis in [axis for row in axes[len(of_volume) :] for axis in row[:-1]]:
-        axis.set_axis_off()
-    for axis in axes.flat:
-        axis.set(xticks=[], yticks=[])
-    for axis, results, name in zip(bottom.subplots(1, 2), (of_volume, of_plane), ("volume", "hand"), strict=True):
-        for code, result in results.items():
-            axis.plot(result["seconds"], result["objectives"], label=code)
-        axis.set(xlabel="time, s", ylabel="objective of the scene", title=name, yscale="log")
-        axis.legend()
-    return figure
+def _median_step(sums: np.ndarray) -> float:
+    return float(np.median(np.diff(sums, prepend=0)))
 
 
-def report(data: Path, scico: str | None, lensless: str | None, progress: Progress) -> Report:
-    pythons = {"gs_jax": sys.executable, "scico": scico, "LenslessPiCam": lensless}
-    given = {code: python for code, python in pythons.items() if python}
-    of_volume = run(volume(data / "diffusercam3d"), given, STEPS["volume"], progress)
-    of_plane = run(plane(data / "diffusercam"), given, STEPS["plane"], progress)
-    rows = {"volume": rows_of(of_volume, LEVEL), "plane": rows_of(of_plane, None)}
-    shown = []
-    for name, results in rows.items():
-        columns = list(results[0])
-        cells = [[_cell(row[column]) for column in columns] for row in results]
-        shown.append(table(columns, cells, title=name))
-    traces = {code: {k: result[k] for k in ("seconds", "objectives", "printed")} for code, result in of_volume.items()}
-    files = {"machine": describe(), "level": LEVEL, "rows": rows, "volume": traces}
-    return Report({"peers_deconvolution.json": files, "peers_deconvolution.png": picture(of_volume, of_plane)}, shown)
+def on_plane(data: Path, factor: int, pythons: dict[str, str], rounds: int, progress: Progress) -> list[dict]:
+    """Time the steps of each method on the hand at a size."""
+    records: list[dict[str, dict]] = [{} for _ in range(rounds)]
+    for results in records:
+        for method, codes in METHODS.items():
+            problem = plane(data, factor, TV if method == "ADMM" else 0.0)
+            results |= run(problem, pythons, {f"{code} {method}": STEPS[factor] for code in codes}, progress)
+    return step_rows(records)
 
 
-def _cell(value) -> str:
-    return "never" if value is None else value if isinstance(value, str) else f"{value:.4g}"
+def step_cells(pixels: str, row: dict) -> list[str]:
+    times = [f"{1000 * row[name]:.3g}" for name in ("seconds_a_step", "processor_seconds_a_step")]
+    rest = (f"{row['peak_mib']:.0f}", f"{row['objective']:.3g}")
+    return [pixels, row["method"], row["code"], times[0], f"{row['over_ours']:.2f}", times[1], *rest]
+
+
+def report(data: Path, scico: str | None, lensless: str | None, rounds: int, progress: Progress) -> Report:
+    all_pythons = {"gs_jax": sys.executable, "scico": scico, "LenslessPiCam": lensless}
+    pythons = {code: python for code, python in all_pythons.items() if python}
+    of_volume = volume_rows(run(volume(data / "diffusercam3d"), pythons, OF_VOLUME, progress))
+    of_plane = {
+        f"{1200 // factor} x {1600 // factor}": on_plane(data / "diffusercam", factor, pythons, rounds, progress)
+        for factor in STEPS
+    }
+    cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in row.values()] for row in of_volume]
+    steps = [step_cells(pixels, row) for pixels, rows in of_plane.items() for row in rows]
+    tables = ((VOLUME_COLUMNS, cells), (STEP_COLUMNS, steps))
+    text = "\n\n".join(markdown_table(*columns_and_rows) for columns_and_rows in tables)
+    numbers = {"machine": describe(), "volume": of_volume, "plane": of_plane}
+    return Report({"peers.json": numbers, "peers.md": text}, [table(*columns_and_rows) for columns_and_rows in tables])
 
 
 if __name__ == "__main__":
     interpreter = {"help": "Python of an environment with this peer."}
-    main(report, {"data": {"type": Path}, "--scico": interpreter, "--lensless": interpreter})
+    arguments = {"data": {"type": Path}, "--scico": interpreter, "--lensless": interpreter}
+    main(report, arguments | {"--rounds": {"type": int, "default": 3, "help": "Rounds [3]."}})

@@ -1,6 +1,6 @@
-"""Run one solver of `peers_deconvolution.py` or `peers_steps.py` in the environment that has it, step by step.
+"""Run one solver of `peers.py` in the environment that has it, step by step.
 
-    PYTHON experiments/peers_deconvolution_runs.py CODE INPUT.npz OUTPUT.npz STEPS
+    PYTHON experiments/peers_runs.py CODE INPUT.npz OUTPUT.npz STEPS
 
 CODE is gs_jax, scico or LenslessPiCam (`pip install scico`, `pip install lensless`, each in an environment of its own),
 for its ADMM, or one with a method, such as "scico FISTA". After each step the objective of its scene is computed here,
@@ -23,8 +23,6 @@ import scipy.fft
 WARM_UP = 2
 # Penalties and relaxation of scico's example of this problem.
 PENALTIES, RELAXATION = (1.0, 5.0, 10.0), 1.8
-# What the steps of Richardson-Lucy that are written here divide an image by, at least; its norm is 1.
-SMALLEST = 1e-8
 
 
 class Problem:
@@ -163,25 +161,6 @@ def scico_fista(problem: Problem) -> Callable[[], Run]:
     return start
 
 
-def scico_richardson_lucy(problem: Problem) -> Callable[[], Run]:
-    """Written here with scico's operators."""
-    import jax
-
-    crop, blur, options = _scico_operators(problem)
-    # Its crop cannot be compiled.
-    blur.jit()
-    A, image = crop @ blur, jax.device_put(np.maximum(problem.image, 0))
-    seen = jax.device_put(_where_seen(np.asarray(A.adj(jax.numpy.ones_like(image)))))
-
-    def start() -> Run:
-        x = jax.device_put(np.ones(options["input_shape"], np.float32))
-        while True:
-            x = jax.block_until_ready(x * A.adj(image / jax.numpy.maximum(A(x), SMALLEST)) / seen)
-            yield partial(np.asarray, x), math.nan
-
-    return start
-
-
 def _scico_operators(problem: Problem) -> tuple[Any, Any, dict]:
     """Crop, sum of convolutions, and the shape and type of scenes."""
     import jax
@@ -227,28 +206,6 @@ def LenslessPiCam_fista(problem: Problem) -> Callable[[], Run]:
     return start
 
 
-def LenslessPiCam_richardson_lucy(problem: Problem) -> Callable[[], Run]:
-    """Written here with its convolution, of a scene that ends where the image does."""
-    from lensless.recon.rfft_convolve import RealFFTConvolve2D  # pyright: ignore[reportMissingImports]
-
-    A = RealFFTConvolve2D(problem.stack[..., None], norm="backward")
-    image = np.maximum(problem.image, 0)[None, None, :, :, None]
-    seen = _where_seen(A.deconvolve(np.ones_like(image)))
-
-    def start() -> Run:
-        x = np.ones_like(image)
-        while True:
-            x = x * A.deconvolve(image / np.maximum(A.convolve(x), SMALLEST)) / seen
-            yield partial(_within, x, problem), math.nan
-
-    return start
-
-
-def _where_seen(sensitivity: np.ndarray) -> np.ndarray:
-    """Infinite where there is rounding alone, so that scenes are dark there."""
-    return np.where(sensitivity > 1e-4 * sensitivity.max(), sensitivity, np.inf).astype(np.float32)
-
-
 def _within(scene, problem: Problem) -> np.ndarray:
     """The middle of a scene that is dark beside it."""
     whole = np.zeros((1, *problem.size), np.float32)
@@ -264,10 +221,8 @@ CODES: dict[str, Callable[[Problem], Callable[[], Run]]] = {
     "gs_jax Richardson-Lucy": gs_jax_richardson_lucy,
     "scico ADMM": partial(scico, prints=False),
     "scico FISTA": scico_fista,
-    "scico Richardson-Lucy": scico_richardson_lucy,
     "LenslessPiCam ADMM": LenslessPiCam,
     "LenslessPiCam FISTA": LenslessPiCam_fista,
-    "LenslessPiCam Richardson-Lucy": LenslessPiCam_richardson_lucy,
 }
 # Packages whose versions are written, by the code.
 PACKAGES = {"gs_jax": ("gs-jax", "jax"), "scico": ("scico", "jax"), "LenslessPiCam": ("lensless", "scipy")}

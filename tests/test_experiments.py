@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from experiments import peers_steps, table1
+from experiments import peers, table1
 from experiments.common import Report, main, table, write
 from gs_jax.base.progress import Progress
 
@@ -63,7 +63,7 @@ def test_ratios_of_steps_are_of_the_same_round():
         {name: step | {"seconds": np.cumsum(3 * [load * seconds])} for name, seconds in codes.items()}
         for load in (1.0, 2.0, 3.0)
     ]
-    ours, theirs = peers_steps.rows_of(rounds)
+    ours, theirs = peers.step_rows(rounds)
     assert (ours["seconds_a_step"], ours["over_ours"]) == (2.0, 1.0)
     assert (theirs["code"], theirs["method"], theirs["seconds_a_step"]) == ("peer", "FISTA", 1.0)
     assert (theirs["over_ours"], theirs["objective"]) == (0.5, 2.0)

@@ -1,6 +1,5 @@
 """The experiments that reproduce the paper's Table 1 and Figs. 3 and 5."""
 
-
 import numpy as np
 import pytest
 
