@@ -1,12 +1,23 @@
-"""Recordings from disk to OME-Zarr: frames per second with one and two workers, memory, killed runs, forecasts."""
+"""Recordings from disk to OME-Zarr, and captures while a camera runs: frames per second, delays, memory, killed runs.
+
+A recording is reconstructed by the command line as one process and with workers; memory, a run that is killed and
+resumed, and the time forecast from few frames are measured at a smaller size. Then a camera writes the same frames as
+files at several rates, and `--watch` reconstructs them: the delay is from a capture's file to its volume's, beside
+reading, computing and writing one frame, one after the other. The latter are measured before and after, because other
+work may load the machine.
+
+    python -m experiments.video_rate [--frames 500] [--pixels 1024] [--many 1000] [--coarse 512] [--out DIR]
+"""
 
 import contextlib
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +25,9 @@ import psutil
 import tifffile
 from matplotlib.figure import Figure
 
+from experiments.common import Report, main, table
 from gs_jax import simulate
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, write_design
 from gs_jax.design.start import geomscope
@@ -25,12 +38,22 @@ from gs_jax.io.volume_series import JOURNAL, VolumeSeries
 from gs_jax.reconstruction.pipeline import Reconstructor, voxel_grid
 from gs_jax.simulation.phantoms import random_points
 
-from .common import Report, main, table
-
 # Seconds between two samples of the process; frames whose parts are timed.
 _EVERY, _TIMED = 0.2, 20
 _NEAR, _FAR, _DEPTHS = 18, 22, 13
 _SEED, _DIFFERENT = 0, 100
+# Rates of the camera, frames/s, its frames, and the seconds after the last in which the newest becomes a volume.
+RATES, _CAMERA, _REST = (5, 16, 32, 64), 300, 1.0
+_RATE = ("--depths", f"{_NEAR}:{_FAR}:{(_FAR - _NEAR) / (_DEPTHS - 1)}")
+LIVE = {
+    "camera_frames_per_s": ("camera, frames/s", ".1f"),
+    "volumes_per_s": ("volumes/s", ".1f"),
+    "cpu_ms": ("processor, ms a volume", ".0f"),
+    "one_ms": ("one, ms", ".0f"),
+    "delay_ms": ("delay, ms", ".0f"),
+    "delay_over_one": ("delay over one", ".2f"),
+    "delay_95_ms": ("95 %, ms", ".0f"),
+}
 
 
 def coarse_design(pixels: int) -> Design:
@@ -44,9 +67,8 @@ def coarse_design(pixels: int) -> Design:
 def write_recording(path: Path, design: Design, frames: int) -> None:
     """Write frames of points with shot noise, 12 bits; a hundred different frames are repeated."""
     rng = np.random.default_rng(_SEED)
-    image = np.asarray(
-        simulate(random_points(50, (8.0, 8.0), (18.0, 22.0), seed=_SEED), design.imager(), optics="near")
-    )
+    points = random_points(50, (8.0, 8.0), (18.0, 22.0), seed=_SEED)
+    image = np.asarray(simulate(points, design.imager(), optics="near"))
     mean = 100 + 2000 * image / image.max()
     images = [rng.poisson(mean).clip(0, 4095).astype(np.uint16) for _ in range(min(frames, _DIFFERENT))]
     with tifffile.TiffWriter(path, bigtiff=True) as tiff:
@@ -54,10 +76,15 @@ def write_recording(path: Path, design: Design, frames: int) -> None:
             tiff.write(images[frame % _DIFFERENT], photometric="minisblack", contiguous=True)
 
 
-def parts(path: Path, design: Design, depths: list[float], folder: Path, frames: int) -> dict[str, float]:
+def depths() -> list[float]:
+    """Depths of the volumes, mm."""
+    return np.linspace(_NEAR, _FAR, _DEPTHS).round(6).tolist()
+
+
+def parts(path: Path, design: Design, folder: Path, frames: int) -> dict[str, float]:
     """Median milliseconds per frame of reading, computing and writing, each alone."""
     imager = design.imager()
-    grid = voxel_grid(imager, depths)
+    grid = voxel_grid(imager, depths())
     volume_of, series = Reconstructor(imager, grid), VolumeSeries(folder / "parts.zarr", frames, grid)
     prepared, times = prepare(imager.sensor.shape), []
     with open_recording(path) as recording:
@@ -67,9 +94,9 @@ def parts(path: Path, design: Design, depths: list[float], folder: Path, frames:
             image = read_frame("a frame", recording.images(frame, Selection()), prepared).image.astype(np.float32)
             read = time.perf_counter()
             volume = volume_of(image, Progress())
-            made = time.perf_counter()
+            computed = time.perf_counter()
             series.write(frame, volume)
-            times.append((read - began, made - read, time.perf_counter() - made))
+            times.append((read - began, computed - read, time.perf_counter() - computed))
     alone = 1000 * np.median(times[1:], axis=0)
     return dict(zip(("reading", "computing", "writing"), alone.tolist(), strict=True))
 
@@ -79,7 +106,7 @@ def watched(folder: Path, frames: int, output: str, *options: str, kill_at: int 
 
     `kill_at`: kill it, with all of its workers, after so many frames.
     """
-    arguments = ["reconstruct", f"{frames}.tif", "design.toml", *_depths(), "-o", output, *options]
+    arguments = ["reconstruct", f"{frames}.tif", "design.toml", *_RATE, "-o", output, *options]
     if "--resume" not in options:
         shutil.rmtree(folder / output, ignore_errors=True)
     began = time.monotonic()
@@ -89,8 +116,8 @@ def watched(folder: Path, frames: int, output: str, *options: str, kill_at: int 
         done = journal.read_bytes().count(b"\n") - 1 if journal.exists() else 0
         looks.append((time.monotonic() - began, done, _memory(process) / 2**20))
         if kill_at is not None and done >= kill_at:
-            for each in (process, *process.children(recursive=True)):
-                each.kill()
+            for running in (process, *process.children(recursive=True)):
+                running.kill()
             process.wait()
         time.sleep(_EVERY)
     seconds, counts, memory = np.array([look for look in looks if look[2]]).T
@@ -104,92 +131,131 @@ def watched(folder: Path, frames: int, output: str, *options: str, kill_at: int 
     }
 
 
-def _depths() -> tuple[str, str]:
-    return "--depths", f"{_NEAR}:{_FAR}:{(_FAR - _NEAR) / (_DEPTHS - 1)}"
-
-
 def _memory(process: psutil.Process) -> int:
     """Resident bytes of a process and its workers; 0 for one that is ending."""
     total = 0
-    for each in (process, *process.children(recursive=True)):
+    for running in (process, *process.children(recursive=True)):
         with contextlib.suppress(psutil.NoSuchProcess):
-            total += each.memory_info().rss
+            total += running.memory_info().rss
     return total
 
 
 def survival(folder: Path, frames: int) -> dict:
     """Whether a run by two workers that is killed and resumed leaves the same files as an uninterrupted run."""
     workers = ("--workers", "2")
-    killed = watched(folder, frames, "killed.zarr", *workers, kill_at=frames // 3)
-    left = (folder / "killed.zarr" / JOURNAL).read_bytes().count(b"\n") - 1
+    watched(folder, frames, "killed.zarr", *workers, kill_at=frames // 3)
+    written = (folder / "killed.zarr" / JOURNAL).read_bytes().count(b"\n") - 1
     watched(folder, frames, "killed.zarr", *workers, "--resume")
     watched(folder, frames, "whole.zarr")
     numbers = [json.loads(line)["frame"] for line in (folder / "killed.zarr" / JOURNAL).read_text().splitlines()[1:]]
-    return {
-        "frames": frames,
-        "there_when_killed": left,
-        "seconds_until_killed": killed["seconds"],
-        "each_once": sorted(numbers) == list(range(frames)),
-        "equal": _voxels(folder / "killed.zarr") == _voxels(folder / "whole.zarr"),
-    }
+    equal = _voxels(folder / "killed.zarr") == _voxels(folder / "whole.zarr")
+    return {"there_when_killed": written, "each_once": sorted(numbers) == list(range(frames)), "equal": equal}
 
 
 def _voxels(path: Path) -> dict[str, bytes]:
     """Files of the volumes: the content of a store without its journal and metadata."""
-    named = {str(each.relative_to(path)): each for each in path.rglob("*") if each.is_file()}
-    return {name: each.read_bytes() for name, each in named.items() if name not in (JOURNAL, "zarr.json")}
+    named = {str(file.relative_to(path)): file for file in path.rglob("*") if file.is_file()}
+    return {name: file.read_bytes() for name, file in named.items() if name not in (JOURNAL, "zarr.json")}
 
 
-def foretold(few: dict, many: dict) -> dict:
-    """Forecast for many frames from a run of few: its seconds before the first frame, and its frames per second."""
-    start = few["seconds"] - few["frames"] / few["frames_per_s"]
-    seconds = start + many["frames"] / few["frames_per_s"]
-    return {"start_s": start, "seconds": seconds, "measured": many["seconds"], "ratio": seconds / many["seconds"]}
+def forecast(few: dict, many: dict) -> float:
+    """Seconds for many frames, from the seconds before the first frame and the frames per second of a run of few."""
+    return few["seconds"] + (many["frames"] - few["frames"]) / few["frames_per_s"]
 
 
-def run(frames: int = 500, pixels: int = 1024, many: int = 1000, coarse: int = 512, few: int = 100) -> dict:
-    """Measure frames per second at one size, and memory, survival and the forecast at a smaller one."""
+def camera(folder: Path, images: np.ndarray, rate: float) -> tuple[float, float]:
+    """Write images as files at a rate; return when it began and ended."""
+    began = time.time()
+    for number, image in enumerate(images):
+        time.sleep(max(0.0, began + number / rate - time.time()))
+        hidden = folder / f".{number:06d}.tif"
+        tifffile.imwrite(hidden, image)
+        hidden.rename(folder / f"{number:06d}.tif")
+    return began, time.time()
+
+
+def live(folder: Path, images: np.ndarray, rate: float) -> dict:
+    """Run the command while a camera writes; return rates, and delays by the times of the files of both.
+
+    Of captures that waited until there was time, the delay is left out: it is that of the camera.
+    """
+    run, store = folder / f"run{rate:g}", folder / f"{rate:g}.zarr"
+    run.mkdir()
+    words = ["reconstruct", run, "design.toml", "--watch", *_RATE, "-o", store]
+    process = psutil.Popen([sys.executable, "-m", "gs_jax", *words], cwd=folder, stderr=subprocess.PIPE, text=True)
+    while "watched until" not in (line := process.stderr.readline()):
+        if not line:
+            raise RuntimeError("the command ended before it watched")
+    before = process.cpu_times()
+    began, ended = camera(run, images, rate)
+    after = process.cpu_times()
+    time.sleep(_REST)
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    lines = [json.loads(line) for line in (store / JOURNAL).read_text().splitlines()[1:]]
+    names = {line["frame"]: line["name"] for line in lines if "name" in line}
+    order = [line["frame"] for line in lines if "name" not in line]
+    written = np.array([(store / f"0/c/{frame}/0/0/0").stat().st_mtime for frame in order])
+    taken = np.array([(run / names[frame]).stat().st_mtime for frame in order])
+    newest = np.array(order) >= np.maximum.accumulate(order)
+    # The first frame makes the store.
+    middle, most = np.percentile(1000 * (written - taken)[newest][1:], (50, 95)).tolist()
+    count = float(np.sum(written <= ended))
+    return {
+        "camera_frames_per_s": len(images) / (ended - began),
+        "volumes_per_s": count / (ended - began),
+        "cpu_ms": 1000 * (after.user + after.system - before.user - before.system) / count,
+        "delay_ms": middle,
+        "delay_95_ms": most,
+    }
+
+
+def run(frames: int, pixels: int, many: int, coarse: int, few: int = 100, rates: Sequence[float] = RATES) -> dict:
+    """Measure frames per second and live delays at one size, and memory, survival and the forecast at a smaller one."""
     results: dict = {"cores": psutil.cpu_count(), "load_before": psutil.getloadavg()}
-    places = np.linspace(_NEAR, _FAR, _DEPTHS).round(6).tolist()
-    here, by = {"here": ()}, {f"{n} workers": ("--workers", str(n)) for n in (1, 2)}
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        design = coarse_design(pixels)
+        folder, design = Path(name), coarse_design(pixels)
+        recording = folder / f"{frames}.tif"
         write_design(folder / "design.toml", design)
-        write_recording(folder / f"{frames}.tif", design, frames)
-        results["rate"] = {key: watched(folder, frames, "v.zarr", *how) for key, how in (here | by).items()}
-        results["alone_ms"] = parts(folder / f"{frames}.tif", design, places, folder, min(frames, _TIMED))
-        results["written_mib"] = sum(len(each) for each in _voxels(folder / "v.zarr").values()) / 2**20
-        results["voxels_z_y_x"] = voxel_grid(design.imager(), places).volume_shape
+        write_recording(recording, design, frames)
+        runs = {"one process": (), "1 worker": ("--workers", "1"), "2 workers": ("--workers", "2")}
+        results["rate"] = {key: watched(folder, frames, "v.zarr", *options) for key, options in runs.items()}
+        results["voxels_z_y_x"] = voxel_grid(design.imager(), depths()).volume_shape
+        results["alone_ms"] = alone = [parts(recording, design, folder, min(frames, _TIMED))]
+        images, results["live"] = tifffile.imread(recording, key=range(min(frames, _CAMERA))), []
+        for rate in rates:
+            row = live(folder, images[: int(max(20, 10 * rate))], rate)
+            alone.append(parts(recording, design, folder, min(frames, _TIMED)))
+            one = float(np.mean([sum(times.values()) for times in alone[-2:]]))
+            results["live"].append(row | {"one_ms": one, "delay_over_one": row["delay_ms"] / one})
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        design = coarse_design(coarse)
+        folder, design = Path(name), coarse_design(coarse)
         write_design(folder / "design.toml", design)
         for count in (few, many):
             write_recording(folder / f"{count}.tif", design, count)
-        for key, how in (here | {"2 workers": by["2 workers"]}).items():
-            short, long = (watched(folder, count, "v.zarr", *how) for count in (few, many))
-            results[f"long, {key}"] = long | {"foretold": foretold(short, long)}
+        results["long"] = {}
+        for key in ("one process", "2 workers"):
+            short, long = (watched(folder, count, "v.zarr", *runs[key]) for count in (few, many))
+            results["long"][key] = long | {"forecast_s": forecast(short, long)}
         results["survival"] = survival(folder, few)
-    return results | {"frames": frames, "pixels": pixels, "coarse": coarse, "load_after": psutil.getloadavg()}
+    return results | {"load_after": psutil.getloadavg()}
 
 
-def picture(results: dict) -> Figure:
+def picture(long: dict[str, dict]) -> Figure:
     """Plot resident memory against frames written."""
     figure = Figure(figsize=(7, 3.4), dpi=100, layout="constrained")
     axes = figure.subplots()
-    most = 0
-    for key, label in (("long, here", "one process"), ("long, 2 workers", "two workers and the scheduling process")):
-        _, done, memory = np.array(results[key]["seconds_frames_mib"]).T
-        running = done < results[key]["frames"]  # the rest is the end of the processes
+    for label, row in long.items():
+        _, done, memory = np.array(row["seconds_frames_mib"]).T
+        running = done < row["frames"]  # the rest is the end of the processes
         axes.plot(done[running], memory[running], label=label)
-        most = max(most, memory.max())
-    axes.set(xlabel="frames written", ylabel="resident memory, MiB", ylim=(0, 1.2 * most))
+    axes.set(xlabel="frames written", ylabel="resident memory, MiB")
+    axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
     axes.legend(fontsize=8)
     return figure
 
 
-def grown(long: dict) -> tuple[float, float]:
+def growth(long: dict) -> tuple[float, float]:
     """Median memory in the second and in the last tenth of the frames, MiB."""
     _, done, memory = np.array(long["seconds_frames_mib"]).T
     tenth = long["frames"] / 10
@@ -197,43 +263,31 @@ def grown(long: dict) -> tuple[float, float]:
     return between(1, 2), between(9, 10)
 
 
-def bars(results: dict) -> list[tuple[str, str, str]]:
-    """Targets, measured values, and whether they are met."""
-    rows = []
-    for key in ("long, here", "long, 2 workers"):
-        early, late = grown(results[key])
-        what = f"memory flat over {results[key]['frames']} frames ({key.split(', ')[1]}; +5 % at most)"
-        rows.append((what, f"{early:.0f} MiB, then {late:.0f}", "met" if late <= 1.05 * early else "missed"))
-    survival = results["survival"]
-    what = f"killed and resumed as uninterrupted ({survival['frames']} frames, 2 workers)"
-    was = f"killed at {survival['there_when_killed']}; every byte of the volumes, each frame once"
-    rows.append((what, was, "met" if survival["equal"] and survival["each_once"] else "missed"))
-    for key in ("long, here", "long, 2 workers"):
-        told = results[key]["foretold"]
-        what = f"{results[key]['frames']} frames foretold from few ({key.split(', ')[1]}; within 25 %)"
-        was = f"{told['seconds']:.0f} s, measured {told['measured']:.0f} s"
-        rows.append((what, was, "met" if 0.75 <= told["ratio"] <= 1.25 else "missed"))
-    return rows
+def summary(results: dict) -> list[tuple[str, str]]:
+    """What was measured, in words."""
+    rows = [(f"{key}: frames/s", f"{row['frames_per_s']:.1f}") for key, row in results["rate"].items()]
+    rows += [(f"{key}: s in all", f"{row['seconds']:.1f}") for key, row in results["rate"].items()]
+    rows += [(f"{name} alone, ms a frame", f"{value:.1f}") for name, value in results["alone_ms"][0].items()]
+    for key, row in results["long"].items():
+        early, late = growth(row)
+        rows.append((f"{row['frames']} frames, {key}: memory, MiB", f"{early:.0f}, then {late:.0f}"))
+        rows.append((f"{row['frames']} frames, {key}: s", f"forecast {row['forecast_s']:.0f}, {row['seconds']:.0f}"))
+    survived = results["survival"]
+    equal = "equal" if survived["equal"] and survived["each_once"] else "DIFFERENT"
+    rows.append((f"killed at frame {survived['there_when_killed']} and resumed", f"{equal} volumes, each frame once"))
+    load = [f"{results[key][0]:.1f}" for key in ("load_before", "load_after")]
+    return [*rows, ("load of the machine", " and ".join(load))]
 
 
 def report(frames: int, pixels: int, many: int, coarse: int, progress: Progress) -> Report:
     with progress.step("Reconstructing"):
         results = run(frames, pixels, many, coarse)
-    alone, rates = results["alone_ms"], results["rate"]
-    rows = [
-        *((f"frames/s, {key}", f"{rate['frames_per_s']:.1f}") for key, rate in rates.items()),
-        *((f"s in all, start and compilation too, {key}", f"{rate['seconds']:.1f}") for key, rate in rates.items()),
-        *((f"ms a frame, {name} alone", f"{value:.1f}") for name, value in alone.items()),
-        ("MiB written", f"{results['written_mib']:.0f}"),
-        ("load of the machine, before and after", f"{results['load_before'][0]:.1f}, {results['load_after'][0]:.1f}"),
-    ]
-    z, y, x = results["voxels_z_y_x"]
-    title = f"{frames} frames of {pixels}^2 to {z} x {y} x {x} voxels"
-    checks = bars(results)
-    text = f"**{title}**\n\n|  |  |\n| --- | ---: |\n" + "".join(f"| {name} | {value} |\n" for name, value in rows)
-    text += "\n| bar | found |  |\n| --- | --- | --- |\n" + "".join(f"| {' | '.join(row)} |\n" for row in checks)
-    shown = [table(("", ""), rows, title), table(("bar", "found", ""), checks)]
-    return Report({"video_rate.json": results, "video_rate.md": text, "video_rate.png": picture(results)}, shown)
+    rows, columns = summary(results), tuple(title for title, _ in LIVE.values())
+    delays = [[format(row[key], form) for key, (_, form) in LIVE.items()] for row in results["live"]]
+    title = "{} frames of {}^2 to {} x {} x {} voxels".format(frames, pixels, *results["voxels_z_y_x"])
+    text = f"**{title}**\n\n{markdown_table(('', ''), rows)}\n\n{markdown_table(columns, delays)}\n"
+    files = {"video_rate.json": results, "video_rate.md": text, "video_rate.png": picture(results["long"])}
+    return Report(files, [table(("", ""), rows, title), table(columns, delays)])
 
 
 if __name__ == "__main__":
