@@ -29,13 +29,11 @@ from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
 from experiments.kernels import count_pairs, cuda_kernels, lens_patches, paper_loop, plain
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax import Grid, Imager, MicrolensArray, Progress, Sensor, backproject, backproject_adjoint, random_layout
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import peak_mib, timed
 from gs_jax.base.arrays import to_float32
 from gs_jax.base.machine import describe, status_mib
-from gs_jax.base.progress import Progress
-from gs_jax.layouts import random_layout
 
 FIELD_MM = 5120 * 0.0045
 
@@ -97,8 +95,11 @@ def bilinear_form(centers, sensor_distance, s: Inputs, power: int = 1):
 def hessian_vector_product(centers, sensor_distance, s: Inputs):
     """Hessian-vector product of the sum of a volume's squares, by centres and sensor distance."""
     here, along = (centers, sensor_distance), (jnp.ones_like(centers), jnp.ones_like(sensor_distance))
-    slope = jax.grad(lambda *moved: bilinear_form(*moved, s, power=2), (0, 1))
-    return jax.jvp(slope, here, along)[1]
+
+    def squares(centers, sensor_distance):
+        return bilinear_form(centers, sensor_distance, s, power=2)
+
+    return jax.jvp(jax.grad(squares, (0, 1)), here, along)[1]
 
 
 class Contestant(NamedTuple):

@@ -27,18 +27,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
+import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
-from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
 from gs_jax.calibration.calibrated_design import plot_residuals
-from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate, spot_residuals
+from gs_jax.calibration.fit import Calibration, self_calibrate, spot_residuals
 from gs_jax.calibration.spot_model import OF_DEVICE
-from gs_jax.design.design import read_design
-from gs_jax.design.start import geomscope
 from gs_jax.geometry import chief_ray
-from gs_jax.io.captures import read_capture
-from gs_jax.metrics import localization
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.pipeline import voxel_grid
 
@@ -54,27 +49,27 @@ SOURCES = np.array([[0.0, 0.0, 18.0], [0.0, 0.0, 20.5], [3.0, 0.0, 20.5], [0.0, 
 REACH = 6.0
 
 
-def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
+def on_captures(data: Path, progress: gs.Progress) -> tuple[dict, Calibration]:
     """Calibrate from the ray-traced captures, whose geometry is known."""
-    imager = read_design(data / "P1.toml").imager()
+    imager = gs.read_design(data / "P1.toml").imager()
     names = sorted(path.stem.removeprefix("P1_") for path in data.glob("P1_i_*.tif"))
     points = np.array([points_of(data, name)[0, :3] for name in names])
-    images = [read_capture(data / f"P1_{name}.tif", imager.sensor.shape) for name in names]
+    images = [gs.read_capture(data / f"P1_{name}.tif", imager.sensor.shape) for name in names]
     begun = time.monotonic()
-    whole = calibrate(images, points, imager, progress=progress)
+    whole = gs.calibrate(images, points, imager, progress=progress)
     seconds = time.monotonic() - begun
-    every = calibrate(images, points, imager, fit=OF_DEVICE, progress=progress)
+    every = gs.calibrate(images, points, imager, fit=OF_DEVICE, progress=progress)
     held_out = {}
     for depth in DEPTHS:
         others, these = np.flatnonzero(points[:, 2] != depth), np.flatnonzero(points[:, 2] == depth)
-        fitted = calibrate([images[k] for k in others], points[others], imager, progress=progress)
+        fitted = gs.calibrate([images[k] for k in others], points[others], imager, progress=progress)
         away = spot_residuals(fitted, [images[k] for k in these], points[these])
         held_out[f"{depth:g} mm"] = float(np.sqrt((away**2).sum(1).mean()))
-    scene, truth = read_capture(data / "P1_d.tif", imager.sensor.shape), points_of(data, "d")
+    scene, truth = gs.read_capture(data / "P1_d.tif", imager.sensor.shape), points_of(data, "d")
     scores = {}
     for name, geometry in (("calibrated", whole.imager), ("design", imager)):
-        results = find_points(scene, geometry, voxel_grid(geometry, SCENE), progress=progress)
-        score = localization(results, truth, axial=0.6)
+        results = gs.find_points(scene, geometry, voxel_grid(geometry, SCENE), progress=progress)
+        score = gs.localization(results, truth, axial=0.6)
         scores[name] = {"f1": score.f1, "axial_um": 1000 * score.axial_rmse}
     turned = eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + TURN)
     alone = self_calibrate(scene, turned, voxel_grid(turned, SCENE), progress=progress)
@@ -98,28 +93,28 @@ def _numbers(results: Calibration) -> dict:
     }
 
 
-def device(seed: int) -> tuple[Imager, Imager, bool]:
+def device(seed: int) -> tuple[gs.Imager, gs.Imager, bool]:
     """Return a random true device, its nominal design, and whether it is mirrored."""
     rng = np.random.default_rng(seed)
-    centers = np.asarray(random_layout(LENSES, (PLATE, PLATE), diameter=None, seed=seed))
-    sensor, mirrored = Sensor((PIXELS, PIXELS), PIXEL), bool(rng.random() < 0.5)
-    design = Imager(MicrolensArray(centers), sensor, rng.uniform(5.7, 5.9), FIELD)
-    built = MicrolensArray(centers * (1, -1) if mirrored else centers)
+    centers = np.asarray(gs.random_layout(LENSES, (PLATE, PLATE), diameter=None, seed=seed))
+    sensor, mirrored = gs.Sensor((PIXELS, PIXELS), PIXEL), bool(rng.random() < 0.5)
+    design = gs.Imager(gs.MicrolensArray(centers), sensor, rng.uniform(5.7, 5.9), FIELD)
+    built = gs.MicrolensArray(centers * (1, -1) if mirrored else centers)
     rotation, shift = rng.uniform(-np.pi, np.pi), rng.uniform(-2, 2, 2)
     tilt = np.tan(np.radians(rng.uniform(-1, 1, 2)))
-    actual = Imager(built, sensor, design.sensor_distance, FIELD, rotation=rotation, shift=shift, tilt=tilt)
+    actual = gs.Imager(built, sensor, design.sensor_distance, FIELD, rotation=rotation, shift=shift, tilt=tilt)
     wrong = design.sensor_distance * rng.uniform(0.8, 1.2)
     return actual, eqx.tree_at(lambda i: i.sensor_distance, design, jnp.asarray(wrong)), mirrored
 
 
-def true_values(imager: Imager) -> dict[str, float]:
+def true_values(imager: gs.Imager) -> dict[str, float]:
     """True values of the calibrated parameters."""
     assert imager.tilt is not None
     numbers = (imager.sensor_distance, np.degrees(imager.rotation), *imager.shift, *np.degrees(np.arctan(imager.tilt)))
     return dict(zip(NAMES, map(float, numbers), strict=True))
 
 
-def on_device(seed: int, progress: Progress) -> dict:
+def on_device(seed: int, progress: gs.Progress) -> dict:
     """Calibrate a simulated device; return the deviations in their units and in standard deviations."""
     actual, design, mirrored = device(seed)
     rng = np.random.default_rng([seed, 1])
@@ -128,8 +123,8 @@ def on_device(seed: int, progress: Progress) -> dict:
     for number, point in enumerate(points):
         light = full_image_of_points(np.append(point, 1.0)[None], actual, progress)
         key = jax.random.key(1000 * seed + number)
-        images.append(np.asarray(expose(light, Camera(gain=1.0), key, peak_electrons=5000)))
-    results = calibrate(images, points, design, progress=progress)
+        images.append(np.asarray(gs.expose(light, gs.Camera(gain=1.0), key, peak_electrons=5000)))
+    results = gs.calibrate(images, points, design, progress=progress)
     true = true_values(actual)
     off = {name: value - true[name] for name, value in results.values.items()}
     off["rotation_deg"] = (off["rotation_deg"] + 180) % 360 - 180
@@ -164,7 +159,7 @@ def moved(which: int | slice, axis: int, by: float) -> np.ndarray:
 
 def mistakes() -> list[tuple[str, float, float]]:
     """Return for each mistake its name, the residual in pixels RMS, and the error of the sensor distance in um."""
-    design = geomscope()
+    design = gs.geomscope()
     v, pixel = design.imaging.sensor_distance_mm, design.sensor.pixel_pitch_um / 1000
     plate = design.array.substrate_thickness_mm / design.refractive_index
     believed = Spots(np.array(design.array.centers_mm), SOURCES, plate)
@@ -192,7 +187,7 @@ def mistakes() -> list[tuple[str, float, float]]:
     return rows
 
 
-def run(data: Path | None, devices: int, *, progress: Progress) -> tuple[dict, Calibration | None]:
+def run(data: Path | None, devices: int, *, progress: gs.Progress) -> tuple[dict, Calibration | None]:
     """Return the content of `calibration.json`, and the calibration from the captures."""
     captures, whole = on_captures(data, progress) if data else ({}, None)
     results = {seed: on_device(seed, progress) for seed in progress.track(range(devices), "Devices")}
@@ -201,7 +196,7 @@ def run(data: Path | None, devices: int, *, progress: Progress) -> tuple[dict, C
     return {"captures": captures, "devices": results, "mistakes": wrong}, whole
 
 
-def report(data: Path | None, devices: int, progress: Progress) -> Report:
+def report(data: Path | None, devices: int, progress: gs.Progress) -> Report:
     results, whole = run(data, devices, progress=progress)
     columns = ("", "median deviation", "largest", "within 3 SD", "SD of the deviations, in SD")
     rows = []

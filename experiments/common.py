@@ -23,11 +23,7 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from skimage.feature import peak_local_max
 
-from gs_jax import Grid, Imager, Sensor
-from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design, read_design
-from gs_jax.design.start import geomscope
+from gs_jax import Design, Grid, Imager, InputError, Progress, Sensor, geomscope, read_design
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.lenses import EACH
 from gs_jax.pictures import PALETTE

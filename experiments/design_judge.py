@@ -6,20 +6,19 @@ the middle of the design's own sensor, and the diffraction of their clear area b
 are those of one exposure time for all designs: 20,000, 3,000 or 500 electrons in the brightest pixel of `geomscope`.
 Volumes are reconstructed with the full model on a grid that is the same for all, 40 x 40 x 300 um, three planes about
 each depth: by Richardson-Lucy, with the best of three numbers of steps for each scene, and by the unrolled inversion,
-on voxels half as wide, which are then shared linearly by those of the grid. Scores, after the best
-gain: PSNR and SSIM; the contrast of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of
-two designs are of the same scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with
-its own noise. A second table has the error that the full model leaves of images without noise, of scenes that lie in
-planes.
+on voxels half as wide, which are then shared linearly by those of the grid. Scores, after the best gain: PSNR and SSIM;
+the contrast of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of two designs are of
+the same scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with its own noise. A
+second table has the error that the full model leaves of images without noise, of scenes that lie in planes.
 
 With `--images model` the full model makes the images, from voxels as fine as the unrolled inversion's: the scores that
 a model without errors would have.
 
     python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--exposures 3000]
-        [--rays 10000] [--images {rays,model}] [--records FILE]
+        [--rays 10000] [--width 0.5] [--images {rays,model}] [--records FILE]
 
-Writes the records after each scene, from which the next run goes on, and then `design_judge.md` and `design_judge.png`;
-about half an hour of two cores for each design, and an hour for sharp ones.
+Writes the records after each scene, from which the next run goes on, and then `design_judge.md`; about half an
+hour of two cores for each design, and an hour for sharp ones.
 """
 
 import hashlib
@@ -31,30 +30,16 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
+import gs_jax as gs
 from experiments.common import Report, cropped, design_file, designs_by_name, main, read_records, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
-from gs_jax import (
-    Grid,
-    Imager,
-    RichardsonLucy,
-    find_points,
-    forward,
-    localization,
-    psf_model,
-    quality,
-    rasterize,
-    read_design,
-)
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
-from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
+from gs_jax.reconstruction.methods import METHODS
 from gs_jax.simulation.phantoms import letters
 
 # Those that come with the package, for 18 to 23 mm; the first defines the exposures.
@@ -97,10 +82,10 @@ class Settings(NamedTuple):
         return np.array([self.span[0] + 0.4, sum(self.span) / 2, self.span[1] - 0.4])
 
     @property
-    def grid(self) -> Grid:
+    def grid(self) -> gs.Grid:
         planes = PLANE * np.arange(-self.around, self.around + 1)
         count = round(self.field / VOXEL) | 1
-        return Grid(np.add.outer(self.depths, planes).ravel(), (count, count), VOXEL)
+        return gs.Grid(np.add.outer(self.depths, planes).ravel(), (count, count), VOXEL)
 
 
 class Scene(NamedTuple):
@@ -157,19 +142,19 @@ def lattice(side: float) -> tuple[np.ndarray, np.ndarray]:
     return x.ravel(), y.ravel()
 
 
-def device(imager: Imager, settings: Settings) -> Imager:
+def device(imager: gs.Imager, settings: Settings) -> gs.Imager:
     """The middle of a sensor, and the lenses near it."""
     pixels = 2 * round(settings.sensor / float(imager.sensor.pixel_pitch) / 2)
     return cropped(imager, pixels, settings.sensor / 2 + 0.4)
 
 
-def mark(name: str, imager: Imager) -> str:
+def mark(name: str, imager: gs.Imager) -> str:
     """The key of a design's records, which another design of the same name does not share."""
     numbers = np.concatenate([np.ravel(x) for x in jax.tree.leaves(imager)])
     return f"{name} {hashlib.sha256(numbers.tobytes()).hexdigest()[:8]}"
 
 
-def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
+def image_of(one: Scene, imager: gs.Imager, settings: Settings) -> np.ndarray:
     """The image without noise: the share of all light in each pixel."""
     light = one.emitters.copy()
     light[:, 3] /= light[:, 3].sum()
@@ -178,15 +163,15 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
     return diffracted(traced(light, imager, settings.rays, TILE), imager)
 
 
-def image_by_model(emitters: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
+def image_by_model(emitters: np.ndarray, imager: gs.Imager, grid: gs.Grid) -> np.ndarray:
     """The full model's image of emitters that the voxels of a grid share."""
-    volume = np.asarray(rasterize(emitters, grid), np.float32)
-    image = jax.jit(forward)(volume, imager, grid, psf_model(imager, grid, "full"))
+    volume = np.asarray(gs.rasterize(emitters, grid), np.float32)
+    image = jax.jit(gs.forward)(volume, imager, grid, gs.psf_model(imager, grid, "full"))
     # Sharpened kernels ring about edges, down to -0.3 % of the brightest pixel.
     return np.maximum(np.asarray(image), 0)
 
 
-def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
+def diffracted(image: np.ndarray, imager: gs.Imager) -> np.ndarray:
     """Blur an image by rays with the diffraction of a disc, as large as the mean clear area of the lenses.
 
     The product of the transfer functions by rays and by diffraction is what lens design programs show beside the one by
@@ -197,7 +182,7 @@ def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
     return np.maximum(np.fft.irfft2(np.fft.rfft2(image) * transfer, image.shape), 0)
 
 
-def diffraction_transfer(imager: Imager, shape: tuple[int, ...], pixel: float) -> np.ndarray:
+def diffraction_transfer(imager: gs.Imager, shape: tuple[int, ...], pixel: float) -> np.ndarray:
     """Transfer function of a disc of the lenses' mean clear area, at the frequencies of `rfft2`; `pixel` in mm."""
     diameter = 2 * np.sqrt(float(clear_area(imager.array).mean()) / np.pi)
     rows, columns = shape
@@ -210,19 +195,19 @@ def diffraction_transfer(imager: Imager, shape: tuple[int, ...], pixel: float) -
 class Methods:
     """The reconstructions of a device, with its tables: functions of an image that return volumes by name."""
 
-    def __init__(self, imager: Imager, settings: Settings):
+    def __init__(self, imager: gs.Imager, settings: Settings):
         self.imager, self.grid, self.settings = imager, settings.grid, settings
         if "richardson-lucy" in settings.methods:
-            self.model = prepare_model(imager, self.grid, "full", Progress())
+            self.model = prepare_model(imager, self.grid, "full", gs.Progress())
             self.problem = InverseProblem(self.model.imager, self.grid, self.model.optics)
             lucy = METHODS["richardson-lucy"](1)
-            assert isinstance(lucy, RichardsonLucy)
-            self.lucy: RichardsonLucy = lucy
-            self.start = jax.jit(lambda problem, light: lucy.init(problem, light))
-            self.step = jax.jit(lambda problem, light, state: lucy.step(problem, light, state)[0])
+            assert isinstance(lucy, gs.RichardsonLucy)
+            self.lucy: gs.RichardsonLucy = lucy
+            self.start = jax.jit(lambda problem, light: lucy.init(problem.operator, light))
+            self.step = jax.jit(lambda problem, light, state: lucy.step(problem.operator, light, state)[0])
         if "unrolled" in settings.methods:
             self.fine = finer(self.grid, settings.width)
-            self.unrolled = Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=Progress())
+            self.unrolled = gs.Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=gs.Progress())
 
     def volumes(self, image: np.ndarray) -> dict[str, np.ndarray]:
         """Volume by each method, Richardson-Lucy's with the number of its steps."""
@@ -235,26 +220,26 @@ class Methods:
                 if number in self.settings.steps:
                     found[f"richardson-lucy {number}"] = np.asarray(self.lucy.estimate(state))
         if "unrolled" in self.settings.methods:
-            found["unrolled"] = shared(self.unrolled(image, Progress()), self.fine, self.grid)
+            found["unrolled"] = shared(self.unrolled(image, gs.Progress()), self.fine, self.grid)
         return found
 
 
-def finer(grid: Grid, width: float) -> Grid:
+def finer(grid: gs.Grid, width: float) -> gs.Grid:
     """Voxels of a relative width over the same field, one in the middle."""
     rows, columns = (round(n / width) | 1 for n in grid.shape)
-    return Grid(grid.depths, (rows, columns), width * grid.pitch, grid.origin)
+    return gs.Grid(grid.depths, (rows, columns), width * grid.pitch, grid.origin)
 
 
-def shared(volume: np.ndarray, fine: Grid, grid: Grid) -> np.ndarray:
+def shared(volume: np.ndarray, fine: gs.Grid, grid: gs.Grid) -> np.ndarray:
     """The light of fine voxels in linear shares of a grid's."""
     z, y, x = np.meshgrid(np.asarray(fine.depths), np.asarray(fine.y), np.asarray(fine.x), indexing="ij")
     voxels = np.column_stack([x.ravel(), y.ravel(), z.ravel(), volume.ravel()])
-    return np.asarray(rasterize(voxels, grid), np.float32)
+    return np.asarray(gs.rasterize(voxels, grid), np.float32)
 
 
-def scores(volume: np.ndarray, truth: np.ndarray, one: Scene, grid: Grid) -> dict[str, Any]:
+def scores(volume: np.ndarray, truth: np.ndarray, one: Scene, grid: gs.Grid) -> dict[str, Any]:
     """PSNR, SSIM, mean squares over the squares of a scene relative to the squared peak, and the contrast of bars."""
-    found = quality(volume, truth)
+    found = gs.quality(volume, truth)
     error = ((found.gain * volume - truth) / truth.max()) ** 2
     squares = [part.mean() for rows in np.array_split(error, SQUARES, 1) for part in np.array_split(rows, SQUARES, 2)]
     record = {"psnr_db": found.psnr_db, "ssim": found.ssim, "squares": [float(x) for x in squares]}
@@ -264,7 +249,7 @@ def scores(volume: np.ndarray, truth: np.ndarray, one: Scene, grid: Grid) -> dic
     return record
 
 
-def contrast(volume: np.ndarray, bar: np.ndarray, grid: Grid) -> float:
+def contrast(volume: np.ndarray, bar: np.ndarray, grid: gs.Grid) -> float:
     """Amplitude of the bars' period over the mean, in the plane of the bars."""
     plane = volume[np.abs(np.asarray(grid.depths) - bar[2]).argmin()]
     x, y = np.asarray(grid.x) - bar[0], np.asarray(grid.y) - bar[1]
@@ -275,11 +260,11 @@ def contrast(volume: np.ndarray, bar: np.ndarray, grid: Grid) -> float:
 
 
 def judged(
-    imager: Imager, one: Scene, clean: np.ndarray, brightest: float, methods: Methods, seed: int = 0
+    imager: gs.Imager, one: Scene, clean: np.ndarray, brightest: float, methods: Methods, seed: int = 0
 ) -> dict[str, Any]:
     """Scores of each exposure and method; `brightest` is the brightest pixel of the reference's image."""
     grid, records = methods.grid, {}
-    truth = np.asarray(rasterize(one.emitters, grid), np.float32)
+    truth = np.asarray(gs.rasterize(one.emitters, grid), np.float32)
     for exposure in methods.settings.exposures:
         rng = np.random.default_rng([seed, exposure])
         image = rng.poisson(clean * (exposure / brightest)) + rng.normal(0, READ_NOISE, clean.shape)
@@ -290,7 +275,7 @@ def judged(
             best = max(steps, key=lambda name: tried[name]["psnr_db"])
             record["richardson-lucy"] = tried[best] | {"steps": int(best.split()[-1])}
         if len(one.points):
-            record["f1"] = localization(find_points(image, imager, grid), one.points).f1
+            record["f1"] = gs.localization(gs.find_points(image, imager, grid), one.points).f1
         records[str(exposure)] = record
     return records
 
@@ -298,12 +283,12 @@ def judged(
 class Judge:
     """Judge designs scene by scene, and keep the records in a file, from which another judge goes on."""
 
-    def __init__(self, file: Path, settings: Settings, reference: Imager):
+    def __init__(self, file: Path, settings: Settings, reference: gs.Imager):
         self.file, self.settings, self.reference = file, settings, device(reference, settings)
         as_json = json.loads(json.dumps(settings._asdict() | {"images": IMAGES[settings.images]}))
         self.kept = read_records(file, "settings", as_json, {"scenes": {}, "found": {}})
 
-    def judge(self, name: str, imager: Imager, draws: Sequence[int], progress: Progress) -> dict[str, Any]:
+    def judge(self, name: str, imager: gs.Imager, draws: Sequence[int], progress: gs.Progress) -> dict[str, Any]:
         """Records of a design by kind of scene and draw."""
         small, methods = device(imager, self.settings), None
         records = self.kept["found"].setdefault(mark(name, small), {})
@@ -366,7 +351,7 @@ def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...]
     return ("scene", "electrons", *names), rows
 
 
-def model_error(imager: Imager, kind: str, settings: Settings) -> float:
+def model_error(imager: gs.Imager, kind: str, settings: Settings) -> float:
     """Error of the full model's image of a scene on fine voxels, after the best gain, relative to that by rays."""
     small, one = device(imager, settings), scene(kind, 0, settings)
     light = subtract_offset(image_of(one, small, settings._replace(images="rays")).astype(np.float32))
@@ -375,50 +360,24 @@ def model_error(imager: Imager, kind: str, settings: Settings) -> float:
     return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))
 
 
-def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
-    """Maxima over the depths of the truth and of volumes by the last method, at the second exposure, of each kind."""
-    kept = json.loads(file.read_text())
-    figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(settings.kinds)), dpi=100, layout="constrained")
-    axes = figure.subplots(len(settings.kinds), len(names) + 1, squeeze=False)
-    exposure = settings.exposures[min(1, len(settings.exposures) - 1)]
-    for column, imager in enumerate([None, *names.values()]):
-        methods = Methods(device(imager, settings), settings) if imager else None
-        for row, kind in enumerate(settings.kinds):
-            one, axis = scene(kind, 0, settings), axes[row, column]
-            truth = shown = np.asarray(rasterize(one.emitters, settings.grid))
-            if methods:
-                clean = image_of(one, methods.imager, settings)
-                rng = np.random.default_rng(0)
-                counts = rng.poisson(clean * (exposure / kept["scenes"][f"{kind} 0"]))
-                image = (counts + rng.normal(0, READ_NOISE, clean.shape)).astype(np.float32)
-                volume = methods.volumes(image)[settings.methods[-1]]
-                shown = quality(volume, truth).gain * volume
-            half = settings.field / 2
-            axis.imshow(shown.max(0), cmap="gray", vmin=0, vmax=truth.max(), extent=(-half, half, half, -half))
-            axis.set_title(f"{list(names)[column - 1] if column else 'truth'}: {kind}", fontsize=8)
-            axis.tick_params(labelsize=7)
-    figure.supxlabel("x, mm", fontsize=8)
-    figure.supylabel("y, mm", fontsize=8)
-    return figure
-
-
 def report(
     designs: list[Path],
     span: list[float],
     draws: int,
     exposures: list[int],
     rays: int,
+    width: float,
     images: str,
     records: Path,
-    progress: Progress,
+    progress: gs.Progress,
 ) -> Report:
     # Planes about the three depths must not meet.
     if draws < 1 or rays < 1 or min(exposures) < 1 or not 0 < span[0] < span[1] - 2:
         wanted = "--draws, --exposures and --rays must be 1 or more, and --span positive and wider than 2 mm"
-        raise InputError(f"{wanted}, got {draws}, {exposures}, {rays} and {span}.")
-    settings = Settings(span=(span[0], span[1]), exposures=tuple(exposures), rays=rays, images=images)
+        raise gs.InputError(f"{wanted}, got {draws}, {exposures}, {rays} and {span}.")
+    settings = Settings((span[0], span[1]), exposures=tuple(exposures), rays=rays, width=width, images=images)
     files = designs or [design_file(name) for name in DESIGNS]
-    reference = read_design(design_file(DESIGNS[0])).imager()
+    reference = gs.read_design(design_file(DESIGNS[0])).imager()
     imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
@@ -430,8 +389,7 @@ def report(
         for name, imager in progress.track(list(imagers.items()), "Images of the model")
     ]
     text = "\n\n".join((markdown_table(columns, rows), markdown_table(of_model, errors)))
-    shown = picture(dict(list(imagers.items())[:2]), judge.file, settings)
-    return Report({"design_judge.md": text, "design_judge.png": shown}, [table(columns, rows), table(of_model, errors)])
+    return Report({"design_judge.md": text}, [table(columns, rows), table(of_model, errors)])
 
 
 if __name__ == "__main__":
@@ -443,6 +401,7 @@ if __name__ == "__main__":
             "--draws": {"type": int, "default": 1},
             "--exposures": {"type": int, "nargs": "+", "default": Settings().exposures},
             "--rays": {"type": int, "default": Settings().rays},
+            "--width": {"type": float, "choices": [0.5, 0.75, 1.0], "default": Settings().width},
             "--images": {"choices": list(IMAGES), "default": Settings().images},
             "--records": {"type": Path, "default": Path("out/design_judge/records.json")},
         },

@@ -39,12 +39,9 @@ from experiments.design_judge import (
     scene,
 )
 from experiments.ray_tracer import bundles
-from gs_jax import Imager, quality, random_layout, rasterize, read_design
+from gs_jax import Design, Imager, Progress, geomscope, quality, random_layout, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
 from gs_jax.codesign.terms import TERMS
-from gs_jax.design.design import Design
-from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.layouts import hexagonal_layout
 from gs_jax.objectives import Conditions
@@ -55,8 +52,6 @@ RANDOM = tuple(f"random {seed}" for seed in range(40))
 NAMED = (*DESIGNS, "geomscope-exposure", "geomscope-table1", "geomscope-targets")
 SETTINGS = Settings(field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
 STEPS = (4, 12)
-# Powers of the light that are tried beside the width of the spot, and those that are shown; draws of halves of designs.
-POWERS, SHOWN, DRAWS = np.arange(0, 0.61, 0.05), (0.1, 0.2, 0.3, 0.4), 300
 # Rays of a voxel to each lens, and voxels along a side that share them.
 RAYS, SHARED = 120, 3
 # Terms, and whether more is better. What depends on the layout alone, or is a limit, is left out.
@@ -118,22 +113,17 @@ def system(imager: Imager) -> sp.csr_matrix:
     count = landed.shape[1] * RAYS
     columns = np.zeros((np.prod(shape), count), np.int32)
     values = np.zeros(columns.shape, np.float32)
-    numbers = iter(range(len(places)))
-    for depth in range(shape[0]):
-        for a in tiles:
-            for b in tiles:
-                number = next(numbers)
-                land = landed[number].reshape(-1, 3)
-                for row in a:
-                    for column in b:
-                        away = np.array([x[column], y[row]]) - places[number][:2]
-                        within = VOXEL * (rng.random((2, count, 2)).sum(0) - 1)
-                        at = land[:, :2] - magnification[number] * (away + within)
-                        pixels = np.floor(at / pixel + side / 2).astype(np.int32)
-                        inside = ((pixels >= 0) & (pixels < side)).all(1)
-                        voxel = np.ravel_multi_index((depth, row, column), shape)
-                        columns[voxel] = np.where(inside, pixels[:, 1] * side + pixels[:, 0], 0)
-                        values[voxel] = np.where(inside, land[:, 2], 0)
+    for number, (depth, a, b) in enumerate(product(range(shape[0]), tiles, tiles)):
+        land = landed[number].reshape(-1, 3)
+        for row, column in product(a, b):
+            away = np.array([x[column], y[row]]) - places[number][:2]
+            within = VOXEL * (rng.random((2, count, 2)).sum(0) - 1)
+            at = land[:, :2] - magnification[number] * (away + within)
+            pixels = np.floor(at / pixel + side / 2).astype(np.int32)
+            inside = ((pixels >= 0) & (pixels < side)).all(1)
+            voxel = np.ravel_multi_index((depth, row, column), shape)
+            columns[voxel] = np.where(inside, pixels[:, 1] * side + pixels[:, 0], 0)
+            values[voxel] = np.where(inside, land[:, 2], 0)
     starts = np.arange(len(columns) + 1) * count
     return sp.csr_matrix((values.ravel(), columns.ravel(), starts), (len(columns), side * side))
 
@@ -211,21 +201,6 @@ def spearman(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
 
 
-def held_out(width: np.ndarray, light: np.ndarray, judge: np.ndarray) -> tuple[float, float, float]:
-    """Correlation of `width / light^p` in half of the designs, with the power that is best in the others.
-
-    The mean and 95 % of the draws of halves.
-    """
-    rng, found = np.random.default_rng(0), []
-    for _ in range(DRAWS):
-        chosen, others = np.array_split(rng.permutation(len(judge)), 2)
-        score = lambda power, some: spearman((power * np.log(light) - np.log(width))[some], judge[some])
-        best = max(POWERS, key=lambda power: score(power, chosen))  # noqa: B023
-        found.append(score(best, others))
-    low, high = np.quantile(found, (0.025, 0.975))
-    return float(np.mean(found)), float(low), float(high)
-
-
 def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
     # Refuse what is wrong before random designs are made.
@@ -252,8 +227,7 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
         if term not in values:
             values[term] = term_of(term, imagers[name])
             write_json(records, kept)
-    of = lambda names: {name: found[name] for name in names}
-    return shown(of(ranked), of((*named, *given)))
+    return shown(*({name: found[name] for name in names} for names in (ranked, (*named, *given))))
 
 
 def mean_psnr(records: dict[str, Any]) -> np.ndarray:
@@ -272,11 +246,6 @@ def shown(found: dict[str, Any], named: dict[str, Any]) -> Report:
     names = sorted(BETTER, key=lambda name: -spearman(judge, values[name]))
     rows = [["the judge's repeat", *both(means[:, 0], means[:, 1])]]
     rows += [[f"`{name}`", *both(judge, values[name])] for name in names]
-    width, light = -values["psf_width_um"], values["light_percent"]
-    rows += [[f"width / light^{p:.2f}", *both(judge, p * np.log(light) - np.log(width))] for p in SHOWN]
-    rows.append(
-        ["the power chosen by half, the others", "{:.2f} ({:.2f} to {:.2f})".format(*held_out(width, light, judge)), ""]
-    )
     columns = ("objective", f"all {len(judge)} designs", "the better half")
     means = [[name, f"{psnr:.1f}"] for name, psnr in zip(named, mean_psnr(named).mean(1), strict=True)]
     tables = ((columns, rows), (("design", "the judge's mean PSNR, dB"), means))

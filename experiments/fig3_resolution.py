@@ -17,10 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
-from gs_jax import Grid, Imager, backproject
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design
-from gs_jax.io.captures import read_capture
+from gs_jax import Design, Grid, Imager, Progress, backproject, read_capture
 from gs_jax.simulation.synthetic import simulate_points
 
 SCENES = {

@@ -23,19 +23,13 @@ from matplotlib.figure import Figure
 from scipy.ndimage import maximum_filter
 from skimage.measure import block_reduce
 
+import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, design_of, local_maxima, main, points_of, table
 from experiments.point_density import scene, scores as density_scores
-from gs_jax import Camera, Grid, expose
 from gs_jax.apps.method_benchmark import timed
-from gs_jax.apps.pictures import draw_image, label_of
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design
-from gs_jax.detection.clusters import find_clusters
-from gs_jax.detection.point_finder import find_points
-from gs_jax.io.captures import read_capture
-from gs_jax.metrics import localization, quality
-from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.phantoms import beads, rasterize
+from gs_jax.detection.particles import find_clusters
+from gs_jax.pictures import draw_image, label_of
+from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.synthetic import simulate_points
 
 # Depths, mm.
@@ -52,45 +46,45 @@ SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002
 BLOCK = 40
 
 
-def run(design: Design, data: Path | None, *, count=120, voxel=0.03, step=0.25, progress: Progress) -> dict:
+def run(design: gs.Design, data: Path | None, *, count=120, voxel=0.03, step=0.25, progress: gs.Progress) -> dict:
     """Return scores of every method on every source of images, and the planes to plot."""
-    grid = Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, step), pitch=voxel)
+    grid = gs.Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, step), pitch=voxel)
     captures = {"simulated": scene(count, 0, design, progress)}
     if data is not None:
         truth = points_of(data, "d")
-        captures["ray-traced"] = truth, read_capture(data / "P1_d.tif", design.imager().sensor.shape)
+        captures["ray-traced"] = truth, gs.read_capture(data / "P1_d.tif", design.imager().sensor.shape)
     return {source: _compare(*both, design, grid, progress) for source, both in captures.items()}
 
 
-def find_beads(design: Design, data: Path | None, *, count=300, progress: Progress) -> dict:
+def find_beads(design: gs.Design, data: Path | None, *, count=300, progress: gs.Progress) -> dict:
     """Return truth, capture, detected points and scores of beads, and of the ray-traced points."""
     imager = design.imager()
     scenes = {"beads, simulated": _beads(design, count, progress)}
     if data is not None:
-        scenes["points, ray-traced"] = points_of(data, "d"), read_capture(data / "P1_d.tif", imager.sensor.shape)
-    grid = Grid.over(imager.sensor, depths=np.arange(17, 23.001, 0.25), pitch=0.03)
+        scenes["points, ray-traced"] = points_of(data, "d"), gs.read_capture(data / "P1_d.tif", imager.sensor.shape)
+    grid = gs.Grid.over(imager.sensor, depths=np.arange(17, 23.001, 0.25), pitch=0.03)
     results = {}
     for name, (truth, capture) in scenes.items():
-        detections = find_points(capture, imager, grid, progress=progress)
+        detections = gs.find_points(capture, imager, grid, progress=progress)
         numbers = {"points": len(truth), "found": len(detections)} | density_scores([(detections, truth)])
         results[name] = {"truth": truth, "capture": capture, "found": detections, "scores": numbers}
         results[name]["extent"] = imager.sensor.extent
     return results
 
 
-def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
+def _beads(design: gs.Design, count: int, progress: gs.Progress) -> tuple[np.ndarray, np.ndarray]:
     """Centres of the beads with their light, and a capture."""
     emitters = beads(count, SIZE, SLAB, pitch=APART)
     balls = emitters.reshape(count, -1, 4)
     balls[..., 3] *= np.random.default_rng(0).uniform(0.3, 1.7, (count, 1)) / balls[0, :, 3].sum()
     image = simulate_points(emitters, design.imager(), kind="full", progress=progress)
-    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=10_000))
+    capture = np.asarray(gs.expose(image, gs.Camera(), jax.random.key(0), peak_electrons=10_000))
     return np.column_stack([balls[..., :3].mean(1), balls[..., 3].sum(1)]), capture
 
 
 def _compare(truth, capture, design, grid, progress) -> dict:
     imager = design.imager()
-    volume = reconstruct(capture, imager, grid, progress=progress)
+    volume = gs.reconstruct(capture, imager, grid, progress=progress)
     points = {
         "nothing": np.zeros((0, 4)),
         "threshold and peaks, the best": _best(lambda lowest: _peaks(volume, grid, lowest), truth),
@@ -100,31 +94,31 @@ def _compare(truth, capture, design, grid, progress) -> dict:
             truth,
         ),
     }
-    search = lambda: find_points(capture, imager, grid, progress=progress)
+    search = lambda: gs.find_points(capture, imager, grid, progress=progress)
     (first, points["find_points"]), again = timed(search), [timed(search)[0] for _ in range(_ROUNDS)]
-    expected = np.asarray(rasterize(truth, grid))
+    expected = np.asarray(gs.rasterize(truth, grid))
     scores = {name: _scores(detections, truth, expected, grid) for name, detections in points.items()}
     scores["find_points"] |= {"first_s": first, "again_s": float(np.median(again))}
-    scores["plain back-projection"] = quality(volume, expected)._asdict()
-    stacks = {"back-projection": volume, "find_points": np.asarray(rasterize(points["find_points"], grid))}
+    scores["plain back-projection"] = gs.quality(volume, expected)._asdict()
+    stacks = {"back-projection": volume, "find_points": np.asarray(gs.rasterize(points["find_points"], grid))}
     shown = [int(np.abs(np.asarray(grid.depths) - depth).argmin()) for depth in SHOWN]
     planes = {name: stack[shown] for name, stack in (stacks | {"truth": expected}).items()}
     return {"points": len(truth), "scores": scores, "planes": planes, "pitch": grid.pitch}
 
 
 def _best(method: Callable[[float], np.ndarray], truth: np.ndarray) -> np.ndarray:
-    return max(map(method, THRESHOLDS), key=lambda detections: localization(detections, truth).f1)
+    return max(map(method, THRESHOLDS), key=lambda detections: gs.localization(detections, truth).f1)
 
 
-def _peaks(volume: np.ndarray, grid: Grid, threshold: float) -> np.ndarray:
+def _peaks(volume: np.ndarray, grid: gs.Grid, threshold: float) -> np.ndarray:
     """Local maxima above a fraction of the highest value, above the median of each plane."""
     above = volume - np.median(volume, axis=(1, 2), keepdims=True)
     return local_maxima(above, grid, threshold_rel=threshold)
 
 
 def _scores(detections, truth, expected, grid) -> dict:
-    score = localization(detections, truth)
-    stack = quality(np.asarray(rasterize(detections, grid)), expected)
+    score = gs.localization(detections, truth)
+    stack = gs.quality(np.asarray(gs.rasterize(detections, grid)), expected)
     a, b = detections[score.pairs[:, 0]], truth[score.pairs[:, 1]]
     ratio = a[:, 3] / b[:, 3]
     paired = len(ratio) > 0
@@ -188,7 +182,7 @@ def picture_of_beads(results: dict) -> Figure:
     return figure
 
 
-def report(data: Path | None, progress: Progress) -> Report:
+def report(data: Path | None, progress: gs.Progress) -> Report:
     design = design_of(data)
     results, of_beads = run(design, data, progress=progress), find_beads(design, data, progress=progress)
     columns = ("found", "precision", "recall", "f1", "lateral_rmse_um", "axial_rmse_um", "psnr_db", "ssim")

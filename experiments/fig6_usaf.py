@@ -23,13 +23,9 @@ from scipy.ndimage import map_coordinates
 from experiments.common import Report, main, table
 from experiments.ray_tracer import traced
 from experiments.true_image import bars
-from gs_jax import Grid
-from gs_jax.apps.pictures import draw_image
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design
-from gs_jax.design.start import geomscope
-from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.synthetic import Camera, electrons, expose
+from gs_jax import Camera, Design, Grid, Progress, expose, geomscope, reconstruct
+from gs_jax.pictures import draw_image
+from gs_jax.simulation.synthetic import electrons
 
 DEPTHS = (18.0, 18.64, 19.27, 19.91, 20.54, 21.18)  # mm, from the paper
 # mm: pitch of voxels and emitters, and the left and upper edges of the groups.

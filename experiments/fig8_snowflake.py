@@ -13,7 +13,6 @@ only the simulated captures are used.
 """
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,20 +23,15 @@ from matplotlib.figure import Figure
 from rich.json import JSON
 from scipy.ndimage import gaussian_filter
 
+import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.phantoms import snowflake
 from experiments.true_image import bars, strokes
-from gs_jax import Grid, Imager
 from gs_jax.apps.example_pipeline import words
-from gs_jax.apps.pictures import draw_image, label_of
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design
-from gs_jax.detection.unet import pretrained, suppress
-from gs_jax.io.captures import read_capture
-from gs_jax.metrics import quality
-from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.phantoms import rasterize
-from gs_jax.simulation.synthetic import Camera, electrons, expose, simulate_points
+from gs_jax.detection.unet import pretrained
+from gs_jax.pictures import draw_image, label_of
+from gs_jax.simulation.phantoms import snowflake
+from gs_jax.simulation.synthetic import electrons, simulate_points
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04
@@ -50,44 +44,44 @@ METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "all zero": np.zeros_like,
     "back-projection": lambda volume: volume,
     "minus its median": lambda volume: np.maximum(volume - np.median(volume), 0),
-    "paper's network": lambda volume: suppress(volume, pretrained("paper")),
-    "our network": lambda volume: suppress(volume, pretrained("multislice")),
+    "paper's network": lambda volume: gs.suppress(volume, pretrained("paper")),
+    "our network": lambda volume: gs.suppress(volume, pretrained("multislice")),
 }
 
 NETWORKS = "paper's network", "our network"
 
 
-def run(design: Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, progress: Progress) -> dict:
-    """Return per scene the truth, volumes and scores by method; the response to noise; and the time of a slice."""
+def run(design: gs.Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, progress: gs.Progress) -> dict:
+    """Return per scene the truth, volumes and scores by method, and the response to noise."""
     imager = design.imager()
-    grid = Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
+    grid = gs.Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
     captures = {name: _simulated(emitters, design, progress) for name, emitters in simulated_scenes().items()}
     if data:
         words_of = json.loads((data / "h.json").read_text())["planes"]
         elements = json.loads((data / "f.json").read_text())["elements"]
         emitters = {"h": np.concatenate([strokes(word) for word in words_of]), "f": bars(elements)}
         for name, scene in (("letters", "h"), ("USAF target", "f")):
-            image = read_capture(data / f"P1_{scene}.tif", imager.sensor.shape)
+            image = gs.read_capture(data / f"P1_{scene}.tif", imager.sensor.shape)
             captures[f"{name}, ray-traced"] = image, emitters[scene]
     scenes = {}
     for name, (counts, emitters) in captures.items():
-        truth = gaussian_filter(np.asarray(rasterize(emitters, grid), np.float32), (0, 1, 1))
+        truth = gaussian_filter(np.asarray(gs.rasterize(emitters, grid), np.float32), (0, 1, 1))
         # The target is small; reconstruct only its part of the field.
         half = round(_TARGET_MM / voxel_mm) if "USAF" in name else max(grid.shape)
         part = slice(None), *(slice(max(n // 2 - half, 0), n // 2 + half + 1) for n in grid.shape)
         volume = _back_projected(counts, imager, grid, progress)
         scenes[name] = {"truth": truth[part], **_judged(volume[part], truth[part])}
-    return {"scenes": scenes, "noise": _of_noise(imager, grid, progress), "seconds_per_slice": _seconds()}
+    return {"scenes": scenes, "noise": _of_noise(imager, grid, progress)}
 
 
 def _judged(volume: np.ndarray, truth: np.ndarray) -> dict:
     volumes = {method: function(volume) for method, function in METHODS.items()}
-    scores = {method: quality(each, truth)._asdict() for method, each in volumes.items()}
+    scores = {method: gs.quality(each, truth)._asdict() for method, each in volumes.items()}
     return {"volumes": volumes, "scores": scores}
 
 
-def _back_projected(counts: np.ndarray, imager: Imager, grid: Grid, progress: Progress) -> np.ndarray:
-    return reconstruct(electrons(counts, Camera()), imager, grid, progress=progress)
+def _back_projected(counts: np.ndarray, imager: gs.Imager, grid: gs.Grid, progress: gs.Progress) -> np.ndarray:
+    return gs.reconstruct(electrons(counts, gs.Camera()), imager, grid, progress=progress)
 
 
 def simulated_scenes() -> dict[str, np.ndarray]:
@@ -96,20 +90,20 @@ def simulated_scenes() -> dict[str, np.ndarray]:
     return {"snowflake, simulated": flake, "letters, simulated": words(EMITTERS_MM)}
 
 
-def _simulated(emitters: np.ndarray, design: Design, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
+def _simulated(emitters: np.ndarray, design: gs.Design, progress: gs.Progress) -> tuple[np.ndarray, np.ndarray]:
     light = simulate_points(emitters, design.imager(), kind="full", progress=progress)
-    counts = expose(np.maximum(light, 0), Camera(), jax.random.key(0), peak_electrons=PEAK_ELECTRONS)
+    counts = gs.expose(np.maximum(light, 0), gs.Camera(), jax.random.key(0), peak_electrons=PEAK_ELECTRONS)
     return np.asarray(counts), emitters
 
 
-def _of_noise(imager: Imager, grid: Grid, progress: Progress) -> dict:
+def _of_noise(imager: gs.Imager, grid: gs.Grid, progress: gs.Progress) -> dict:
     """Largest output of the networks for captures without an object, in standard deviations of the volume.
 
     The captures are dark with read noise, and uniformly lit with shot noise.
     """
     results = {name: {} for name in ("dark", "evenly lit")}
     for name, image in zip(results, (np.zeros, np.ones), strict=True):
-        counts = expose(image(imager.sensor.shape, np.float32), Camera(), jax.random.key(1), peak_electrons=100)
+        counts = gs.expose(image(imager.sensor.shape, np.float32), gs.Camera(), jax.random.key(1), peak_electrons=100)
         volume = _back_projected(np.asarray(counts), imager, grid, progress)
         for method in NETWORKS:
             made = METHODS[method](volume)
@@ -118,23 +112,6 @@ def _of_noise(imager: Imager, grid: Grid, progress: Progress) -> dict:
                 "rms_by_rms": float(np.sqrt(np.mean(made**2) / np.mean(volume**2))),
             }
     return results
-
-
-def _seconds(rounds: int = 5) -> dict:
-    """Median time of a 512 x 512 slice in a stack of seven, in interleaved rounds after compilation."""
-    volume = np.random.default_rng(0).random((7, 512, 512), np.float32)
-    taken = {name: [] for name in NETWORKS}
-    for _ in range(rounds + 1):
-        for name, times in taken.items():
-            started = time.perf_counter()
-            METHODS[name](volume)
-            times.append((time.perf_counter() - started) / len(volume))
-    return {name: float(np.median(times[1:])) for name, times in taken.items()}
-
-
-def numbers(results: dict) -> dict:
-    """Results without the volumes."""
-    return results | {"scenes": {name: scene["scores"] for name, scene in results["scenes"].items()}}
 
 
 def picture(scene: dict, shown: tuple[float, ...] = (18.0, 20.0, 22.0), *, upward: bool = False) -> Figure:
@@ -161,9 +138,10 @@ def picture(scene: dict, shown: tuple[float, ...] = (18.0, 20.0, 22.0), *, upwar
     return figure
 
 
-def report(data: Path | None, progress: Progress) -> Report:
+def report(data: Path | None, progress: gs.Progress) -> Report:
     results = run(design_of(data), data, progress=progress)
-    files: dict[str, Any] = {"fig8.json": numbers(results)}
+    scores = {name: scene["scores"] for name, scene in results["scenes"].items()}
+    files: dict[str, Any] = {"fig8.json": results | {"scenes": scores}}
     tables = []
     for name, scene in results["scenes"].items():
         shown = (18.0,) if "USAF" in name else (18.0, 20.0, 22.0)
@@ -174,7 +152,7 @@ def report(data: Path | None, progress: Progress) -> Report:
             for method, s in scene["scores"].items()
         ]
         tables.append(table(("method", "PSNR, dB", "SSIM", "MSE", "MSE, of back-projection's"), rows, name))
-    return Report(files, [*tables, JSON.from_data({key: results[key] for key in ("noise", "seconds_per_slice")})])
+    return Report(files, [*tables, JSON.from_data(results["noise"])])
 
 
 if __name__ == "__main__":

@@ -28,26 +28,20 @@ import numpy as np
 from jaxtyping import Float32, Num
 from matplotlib.figure import Figure
 
+import gs_jax as gs
 from experiments.common import Report, local_maxima, main, points_of
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
-from gs_jax import Grid, Imager, Surface, Unrolled, forward_residual
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import render_points, timed
-from gs_jax.apps.pictures import draw_image, label_of
-from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import read_design
-from gs_jax.detection.clusters import find_clusters
-from gs_jax.detection.point_finder import find_points
-from gs_jax.detection.unet import pretrained, suppress
-from gs_jax.io.captures import read_capture
-from gs_jax.metrics import localization, quality
+from gs_jax.detection.particles import find_clusters
+from gs_jax.detection.unet import pretrained
 from gs_jax.optics.theory import FWHM
-from gs_jax.reconstruction.networks import read_unrolled
-from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, reconstruct, voxel_grid
-from gs_jax.simulation.phantoms import letters, rasterize
-from gs_jax.simulation.synthetic import Camera, expose
+from gs_jax.pictures import draw_image, label_of
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.simulation.phantoms import letters, snowflake
+from gs_jax.solvers.unrolled import read_unrolled
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")
 STEPS = 20
@@ -59,28 +53,28 @@ _RAYS = 8
 
 class Scene(NamedTuple):
     image: Num[np.ndarray, "row column"]
-    imager: Imager
-    grid: Grid
+    imager: gs.Imager
+    grid: gs.Grid
     truth: Float32[np.ndarray, "depth y x"]
     points: np.ndarray | None = None  # (x, y, z, flux), if the scene is points
 
 
 def _captured(data: Path, name: str, depths: np.ndarray, emitters: np.ndarray | None) -> Scene:
     """Load a capture of the other group's tracer, on the default voxels of iterative methods."""
-    imager = read_design(data / "P1.toml").imager()
-    image = read_capture(data / f"P1_{name}.tif", imager.sensor.shape)
+    imager = gs.read_design(data / "P1.toml").imager()
+    image = gs.read_capture(data / f"P1_{name}.tif", imager.sensor.shape)
     grid = voxel_grid(imager, list(depths), pixels=PIXELS_PER_VOXEL)
     if emitters is None:
         points = points_of(data, name)
         return Scene(image, imager, grid, render_points(points, grid, grid.pitch / FWHM), points)
-    return Scene(image, imager, grid, np.asarray(rasterize(emitters, grid), np.float32))
+    return Scene(image, imager, grid, np.asarray(gs.rasterize(emitters, grid), np.float32))
 
 
-def _traced(imager: Imager, depths: np.ndarray, emitters: np.ndarray) -> Scene:
+def _traced(imager: gs.Imager, depths: np.ndarray, emitters: np.ndarray) -> Scene:
     grid = voxel_grid(imager, list(depths), pixels=PIXELS_PER_VOXEL)
     light = traced(emitters, imager, _RAYS)
-    image = np.asarray(expose(light, Camera(), jax.random.key(0), peak_electrons=10_000))
-    return Scene(image, imager, grid, np.asarray(rasterize(emitters, grid), np.float32))
+    image = np.asarray(gs.expose(light, gs.Camera(), jax.random.key(0), peak_electrons=10_000))
+    return Scene(image, imager, grid, np.asarray(gs.rasterize(emitters, grid), np.float32))
 
 
 def _points(data: Path) -> Scene:
@@ -99,7 +93,7 @@ def _target(data: Path) -> Scene:
 
 def _snowflake(data: Path) -> Scene:
     flake = snowflake((18.0, 22.0), size=14.0, tilt=0.4, width=0.5, pitch=0.03)
-    return _traced(read_design(data / "P1.toml").imager(), np.arange(18.0, 22.01, 0.5), flake)
+    return _traced(gs.read_design(data / "P1.toml").imager(), np.arange(18.0, 22.01, 0.5), flake)
 
 
 def _other_lenses(data: Path) -> Scene:
@@ -136,20 +130,20 @@ class Result(NamedTuple):
     points: np.ndarray | None = None
 
 
-def methods(s: Scene, networks: Unrolled, steps: int, progress: Progress) -> dict[str, Callable[[], Result]]:
+def methods(s: Scene, networks: gs.Unrolled, steps: int, progress: gs.Progress) -> dict[str, Callable[[], Result]]:
     """Every method as a function without arguments, by name."""
-    by = lambda method: reconstruct(s.image, s.imager, s.grid, method, progress=progress)
+    by = lambda method: gs.reconstruct(s.image, s.imager, s.grid, method, progress=progress)
     solve = lambda name: by(METHODS[name](steps))
     of = lambda points: Result(render_points(points, s.grid, float(s.grid.pitch) / FWHM), points)
     return {
         "zeros": lambda: Result(np.zeros_like(s.truth)),
         "backproject": lambda: Result(solve("backproject")),
-        "backproject + points": lambda: of(find_points(s.image, s.imager, s.grid, progress=progress)),
+        "backproject + points": lambda: of(gs.find_points(s.image, s.imager, s.grid, progress=progress)),
         "backproject + clusters": lambda: of(find_clusters(solve("backproject"), s.grid)),
-        "backproject + paper's U-Net": lambda: Result(suppress(solve("backproject"), pretrained("paper"))),
-        "backproject + our U-Net": lambda: Result(suppress(solve("backproject"), pretrained())),
+        "backproject + paper's U-Net": lambda: Result(gs.suppress(solve("backproject"), pretrained("paper"))),
+        "backproject + our U-Net": lambda: Result(gs.suppress(solve("backproject"), pretrained())),
         "unrolled": lambda: Result(by(networks)),
-        "surface": lambda: Result(by(Surface())),
+        "surface": lambda: Result(by(gs.Surface())),
         **{name: (lambda name=name: Result(solve(name))) for name in ITERATIVE},
         "truth": lambda: Result(s.truth),
     }
@@ -164,11 +158,16 @@ def best_f1(result: Result, s: Scene) -> float | None:
         results = local_maxima(result.volume, s.grid, min_distance=1, threshold_rel=DARKEST)
     results = results[np.argsort(-results[:, 3], kind="stable")]
     numbers = np.unique(np.geomspace(1, max(len(results), 1), 100).round().astype(int))
-    return max(localization(results[:n], s.points, axial=0.6).f1 for n in numbers)
+    return max(gs.localization(results[:n], s.points, axial=0.6).f1 for n in numbers)
 
 
 def run(
-    data: Path, networks: Unrolled, scenes: Sequence[str] = tuple(SCENES), *, steps: int = STEPS, progress: Progress
+    data: Path,
+    networks: gs.Unrolled,
+    scenes: Sequence[str] = tuple(SCENES),
+    *,
+    steps: int = STEPS,
+    progress: gs.Progress,
 ) -> tuple[dict, dict[tuple[str, str], View]]:
     """Return the content of `captures.json`, and maxima over the depths by scene and method."""
     rows, pictures = [], {}
@@ -176,9 +175,9 @@ def run(
         s = SCENES[name](data)
         for method, call in progress.track(methods(s, networks, steps, progress).items(), name):
             seconds, result = timed(call)
-            q = quality(result.volume, s.truth)
+            q = gs.quality(result.volume, s.truth)
             scores = {"psnr_db": q.psnr_db, "ssim": q.ssim, "mse": q.mse, "f1": best_f1(result, s)}
-            again = forward_residual(result.volume, s.image, s.imager, s.grid, progress=progress).error
+            again = gs.forward_residual(result.volume, s.image, s.imager, s.grid, progress=progress).error
             rows.append({"scene": name, "method": method, "seconds": seconds} | scores | {"reprojection": again})
             pictures[name, method] = View(result.volume.max(0), s.grid.extent)
     return {"rows": rows}, pictures
@@ -211,11 +210,11 @@ def picture(pictures: dict[tuple[str, str], View]) -> Figure:
     return figure
 
 
-def report(data: Path, scenes: str, weights: Path | None, progress: Progress) -> Report:
+def report(data: Path, scenes: str, weights: Path | None, progress: gs.Progress) -> Report:
     names = scenes.split(",")
     if unknown := [name for name in names if name not in SCENES]:
-        raise InputError(f"--scenes: found {', '.join(unknown)}, allowed: {', '.join(SCENES)}.")
-    networks = read_unrolled(weights) if weights else Unrolled.pretrained()
+        raise gs.InputError(f"--scenes: found {', '.join(unknown)}, allowed: {', '.join(SCENES)}.")
+    networks = read_unrolled(weights) if weights else gs.Unrolled.pretrained()
     results, pictures = run(data, networks, names, progress=progress)
     text = markdown(results)
     return Report({"captures.json": results, "captures.md": text, "captures.png": picture(pictures)}, [text])

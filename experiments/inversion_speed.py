@@ -23,12 +23,10 @@ import gs_jax as gs
 from experiments.backprojection_speed import in_new_process
 from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.errors import InputError
 from gs_jax.base.machine import status_mib
-from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.inverse_problem import prepare_model
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
+from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
 
 DEPTHS = np.linspace(18.0, 22.0, 9).tolist()
 MODELS = ("near", "full")
@@ -79,7 +77,7 @@ def of_model(name: str, capture: Path, pixels: int) -> dict[str, Any]:
     scope = imager_of(pixels)
     grid = voxel_grid(scope, DEPTHS, None, pixels=PIXELS_PER_VOXEL)
     began = time.perf_counter()
-    model = prepare_model(scope, grid, name, Progress())
+    model = prepare_model(scope, grid, name, gs.Progress())
     results: dict[str, Any] = {f"{name} model: tables": {"first_s": time.perf_counter() - began}}
     A, volume = gs.ImagingOperator(model.imager, grid, model.optics), scene(grid.volume_shape)
     forward, adjoint = jax.jit(lambda A, x: A.mv(x)), jax.jit(lambda A, y: A.T.mv(y))
@@ -96,8 +94,8 @@ def of_method(name: str, capture: Path, pixels: int) -> dict[str, Any]:
     """Time a method on the capture."""
     scope, image = imager_of(pixels), np.load(capture)
     grid = voxel_grid(scope, DEPTHS, None, pixels=PIXELS_PER_VOXEL)
-    invert = Reconstructor(scope, grid, METHODS[name](20), progress=Progress())
-    seconds, _ = measure(lambda: invert(image, Progress()), 1)
+    invert = gs.Reconstructor(scope, grid, METHODS[name](20), progress=gs.Progress())
+    seconds, _ = measure(lambda: invert(image, gs.Progress()), 1)
     return {name: seconds | {"memory_mib": status_mib("VmHWM")}}
 
 
@@ -119,7 +117,7 @@ def of_others(name: str, capture: Path, pixels: int) -> dict[str, Any]:
     return {name: measure(call, ROUNDS)[0] for name, call in calls.items()}
 
 
-def run(names: list[str], pixels: int, progress: Progress) -> dict[str, dict[str, float]]:
+def run(names: list[str], pixels: int, progress: gs.Progress) -> dict[str, dict[str, float]]:
     """Seconds and memory by what is timed."""
     results = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -130,10 +128,10 @@ def run(names: list[str], pixels: int, progress: Progress) -> dict[str, dict[str
     return results
 
 
-def report(methods: str, pixels: int, progress: Progress) -> Report:
+def report(methods: str, pixels: int, progress: gs.Progress) -> Report:
     names = methods.split(",")
     if unknown := [name for name in names if name not in NAMES]:
-        raise InputError(f"--methods must be of {', '.join(NAMES)}, got {', '.join(unknown)}.")
+        raise gs.InputError(f"--methods must be of {', '.join(NAMES)}, got {', '.join(unknown)}.")
     results = run(names, pixels, progress)
     cell = lambda row, key: format(row[key], COLUMNS[key][1]) if key in row else ""
     rows = [[name, *(cell(row, key) for key in COLUMNS)] for name, row in results.items()]

@@ -20,12 +20,12 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 
 from experiments.common import Report, main, table
 from experiments.optics_check import optiland_rays
+from gs_jax import Design, Progress, read_design, read_study
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import new_design
 from gs_jax.codesign.pareto import sweep_of, trade_off
-from gs_jax.codesign.study import Study, read_study
-from gs_jax.design.design import Design, design_text, read_design
+from gs_jax.codesign.study import Study
+from gs_jax.design.design import design_text
 from gs_jax.geometry import envelope
 from gs_jax.optics.apertures import clear_diameter
 from gs_jax.optics.psf import diffraction_psf

@@ -14,17 +14,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from gs_jax import Imager
+from gs_jax import Design, Imager, Progress, geomscope, read_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design, read_design
-from gs_jax.design.start import geomscope
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
-from gs_jax.mold.lenslets import Part
-from gs_jax.mold.make import draw_solid
 from gs_jax.mold.measurement import measure_lenslets, summarize
 from gs_jax.mold.solids import (
     MoldShape,
@@ -61,26 +55,26 @@ def differing(imager: Imager) -> Imager:
 
 def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     """Make the array and the mold at one chord error, write, read back and measure."""
-    part, shape = Part(imager.array), MoldShape(label=label)
+    array, shape = imager.array, MoldShape(label=label)
     started = time.perf_counter()
-    array = array_solid(part, chord_um / 1000)
+    part = array_solid(array, chord_um / 1000)
     made = time.perf_counter() - started
-    mold = mold_solid(part, array, shape)
+    mold = mold_solid(array, part, shape)
     with tempfile.TemporaryDirectory() as folder:
-        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (array, mold)]
+        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (part, mold)]
     volumes = [mesh.solid().volume() for mesh in meshes]
-    block = float(np.prod(np.diff(mold_bounds(part, shape), axis=0)))
-    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(part, shape))
-    cast = cast_solid(part, array, shape).volume()
-    numbers = summarize(measure_lenslets(meshes[1], part), imager)
+    block = float(np.prod(np.diff(mold_bounds(array, shape), axis=0)))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(array, shape))
+    cast = cast_solid(array, part, shape).volume()
+    numbers = summarize(measure_lenslets(meshes[1], array), imager)
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),
         "seconds": made,
-        "array_volume_error": volumes[0] / array_volume(part) - 1,
-        "mold_volume_error": volumes[1] / mold_volume(part, shape) - 1,
+        "array_volume_error": volumes[0] / array_volume(array) - 1,
+        "mold_volume_error": volumes[1] / mold_volume(array, shape) - 1,
         "block_filled_error": (volumes[1] + volumes[0] + engraved) / block - 1,
-        "cast_is_array_error": cast / array.volume() - 1,
+        "cast_is_array_error": cast / part.volume() - 1,
         **numbers,
     }
 
@@ -88,47 +82,6 @@ def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
 def _through_file(solid, path: Path) -> Mesh:
     write_mesh(path, float32_mesh(solid), "part")
     return read_mesh(path)
-
-
-def draw(design: Design, records: list[dict]) -> Figure:
-    """Plot the mold, facets of a few lenses, and the errors of the facets."""
-    part = Part(design.imager().array)
-    figure = Figure(figsize=(15, 4.6), dpi=110, layout="constrained")
-    view = figure.add_subplot(1, 3, 1, projection="3d")
-    shape = MoldShape(label=design.name)
-    draw_solid(view, mold_solid(part, array_solid(part, 4e-3), shape), from_below=False)
-    view.set_title(f"mold of {len(part.centers)} lenses")
-    _draw_facets(figure.add_subplot(1, 3, 2), part)
-    axes = figure.add_subplot(1, 3, 3)
-    _draw_cost(axes, records)
-    return figure
-
-
-def _draw_facets(axes, part: Part) -> None:
-    mesh = float32_mesh(array_solid(part, 2e-3))
-    x, y, z = mesh.vertices.T
-    height = -part.plate_thickness - z
-    corners = mesh.vertices[mesh.facets]
-    shown = (np.abs(corners[..., :2]).max(axis=(1, 2)) < 2.2) & (corners[..., 2].max(axis=1) < 0)
-    image = axes.tripcolor(x, y, mesh.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")
-    axes.triplot(x, y, mesh.facets[shown], color="white", linewidth=0.25)
-    axes.set(xlim=(-1.8, 1.8), ylim=(1.8, -1.8), aspect="equal", xlabel="x, mm", ylabel="y, mm")
-    axes.set_title("facets within 2 um of the lenses")
-    axes.figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
-
-
-def _draw_cost(axes, records: list[dict]) -> None:
-    chord = [record["chord_um"] for record in records]
-    strehl = [record["strehl_of_facets_median"] for record in records]
-    axes.semilogx(chord, strehl, "o-")
-    axes.axhline(0.8, color="gray", linewidth=0.8, linestyle="--")
-    axes.set(xlabel="chord error, um", ylabel="Strehl ratio of the facets alone", ylim=(0, 1.02))
-    axes.set_title("what facets cost")
-    right = axes.twinx()
-    right.semilogy(chord, [record["facets"] for record in records], "s--", color="C6")
-    right.set_ylabel("facets", color="C6")
-    axes.set_xticks(chord, [f"{value:g}" for value in chord])
-    axes.set_xticks([], minor=True)
 
 
 COLUMNS = {
@@ -158,7 +111,7 @@ def report(progress: Progress) -> Report:
     ]
     titles, lines, unequal = [title for title, _ in COLUMNS.values()], rows(records), rows(others)
     text = "\n\n".join(markdown_table(titles, part) for part in (lines, unequal)) + "\n"
-    data = {"mold.json": {"alike": records, "unequal": others}, "mold.md": text, "mold.png": draw(design, records)}
+    data = {"mold.json": {"alike": records, "unequal": others}, "mold.md": text}
     return Report(data, [table(titles, lines), table(titles, unequal)])
 
 

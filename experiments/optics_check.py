@@ -32,12 +32,9 @@ from scipy.spatial import KDTree
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of, table
 from experiments.ray_tracer import traced
-from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.base.progress import Progress
+from gs_jax import Design, Imager, MicrolensArray, Progress, Sensor, read_capture, read_design
 from gs_jax.calibration.spots import find_spots
-from gs_jax.design.design import Design, read_design
 from gs_jax.geometry import envelope
-from gs_jax.io.captures import read_capture
 from gs_jax.layers import layers_in_front, object_index
 from gs_jax.optics.aberrations import best_focus, independent_rms, seidel_of_array, wavefront_rms
 from gs_jax.optics.apertures import aperture_area

@@ -25,9 +25,9 @@ import numpy as np
 import tifffile
 
 from experiments.common import Report, main, table
+from gs_jax import Progress
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.machine import describe
-from gs_jax.base.progress import Progress
 
 # Planes of the stack that the example takes, the weights of its priors, and the steps of each code.
 PLANES, EXAMPLE_TV, EXAMPLE_L1 = slice(1, 37), 3e-3, 1e-2

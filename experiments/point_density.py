@@ -21,18 +21,12 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
+import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, local_maxima, main, table
-from gs_jax import Grid, Imager
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design, read_design
-from gs_jax.design.start import geomscope
 from gs_jax.detection.background import subtract_background
-from gs_jax.detection.point_finder import find_points
-from gs_jax.metrics import localization
 from gs_jax.projection.point_sources import full_imager_of_points
-from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.synthetic import Camera, expose, simulate_points
+from gs_jax.simulation.synthetic import simulate_points
 
 # Numbers of points, and numbers of captures of each.
 SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}
@@ -44,35 +38,37 @@ WATER = {"sample": {"refractive_index": 1.333, "surface_mm": 17.0}}
 MEDIA: dict[str, tuple[dict, tuple[float, float]]] = {"air": ({}, (18.0, 22.0)), "water": (WATER, (17.4, 22.5))}
 
 
-def run(design: Design, scenes: dict[int, int] | None = None, *, voxel=0.03, step=0.25, progress: Progress) -> list:
+def run(
+    design: gs.Design, scenes: dict[int, int] | None = None, *, voxel=0.03, step=0.25, progress: gs.Progress
+) -> list:
     """Return the scores of both methods for each number of points, over all captures together."""
     imager = design.imager()
-    grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0] - 1, DEPTHS[1] + 1.001, step), pitch=voxel)
+    grid = gs.Grid.over(imager.sensor, depths=np.arange(DEPTHS[0] - 1, DEPTHS[1] + 1.001, step), pitch=voxel)
     rows = []
     for count, seeds in (SCENES if scenes is None else scenes).items():
         detections = {"gs_jax": [], "brightest peaks": []}
         for seed in range(seeds):
             truth, capture = scene(count, seed, design, progress)
-            detections["gs_jax"].append((find_points(capture, imager, grid, progress=progress), truth))
+            detections["gs_jax"].append((gs.find_points(capture, imager, grid, progress=progress), truth))
             detections["brightest peaks"].append((brightest_peaks(capture, imager, grid, count, progress), truth))
         rows.append({"points": count, "captures": seeds} | {name: scores(pairs) for name, pairs in detections.items()})
     return rows
 
 
-def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
+def scene(count: int, seed: int, design: gs.Design, progress: gs.Progress) -> tuple[np.ndarray, np.ndarray]:
     """Points, and a capture of them."""
     truth = random_points(count, SIZE, DEPTHS, seed=seed)
     truth[:, 3] = np.random.default_rng(seed).uniform(0.5, 1.5, count)
     image = simulate_points(truth, design.imager(), kind="full", progress=progress)
-    return truth, np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=10_000))
+    return truth, np.asarray(gs.expose(image, gs.Camera(), jax.random.key(seed), peak_electrons=10_000))
 
 
-def draws(design: Design, number: int, beads: Iterable[int] = BEADS, *, progress: Progress) -> list[dict]:
+def draws(design: gs.Design, number: int, beads: Iterable[int] = BEADS, *, progress: gs.Progress) -> list[dict]:
     """Return the scores of this number of captures for each medium and number of beads."""
     rows = []
     for medium, (keys, depths) in MEDIA.items():
         imager = middle_of(design, keys).imager()
-        grid = Grid.over(imager.sensor, depths=[depths[0] - 0.2, depths[1] + 0.2], pitch=0.03)
+        grid = gs.Grid.over(imager.sensor, depths=[depths[0] - 0.2, depths[1] + 0.2], pitch=0.03)
         corners = np.concatenate([corners_at(z) for z in np.linspace(*depths, 50)])
         image_of = full_imager_of_points(corners, imager, progress)
         for count in beads:
@@ -81,15 +77,15 @@ def draws(design: Design, number: int, beads: Iterable[int] = BEADS, *, progress
                 rng = np.random.default_rng([seed, count])
                 truth = random_points(count, BOX, depths, seed=seed)
                 truth[:, 3] = RATIO ** rng.uniform(0, 1, count)
-                counts = expose(image_of(truth), Camera(), jax.random.key(seed), peak_electrons=10_000)
+                counts = gs.expose(image_of(truth), gs.Camera(), jax.random.key(seed), peak_electrons=10_000)
                 # Without the warning of blur, which would be traced for each.
-                pairs.append((find_points(subtract_background(np.asarray(counts)), imager, grid), truth))
+                pairs.append((gs.find_points(subtract_background(np.asarray(counts)), imager, grid), truth))
             row = {"medium": medium, "beads": count, "draws": number, **scores(pairs)}
             rows.append(row | {"false": round(sum(len(found) for found, _ in pairs) * (1 - row["precision"]))})
     return rows
 
 
-def middle_of(design: Design, keys: dict) -> Design:
+def middle_of(design: gs.Design, keys: dict) -> gs.Design:
     """The lenses in the middle of a design over a smaller sensor, with other values of some keys."""
     centers = np.array(design.array.centers_mm)
     centers = centers[np.argsort(np.abs(centers).max(1), kind="stable")[:LENSES]]
@@ -103,9 +99,11 @@ def corners_at(depth: float) -> np.ndarray:
     return np.array([[-x, -y, depth], [x, y, depth]])
 
 
-def brightest_peaks(capture: np.ndarray, imager: Imager, grid: Grid, count: int, progress: Progress) -> np.ndarray:
+def brightest_peaks(
+    capture: np.ndarray, imager: gs.Imager, grid: gs.Grid, count: int, progress: gs.Progress
+) -> np.ndarray:
     """The highest local maxima of the plain back-projection, `(x, y, z, value)`."""
-    volume = reconstruct(capture, imager, grid, progress=progress)
+    volume = gs.reconstruct(capture, imager, grid, progress=progress)
     return local_maxima(volume, grid, min_distance=1, num_peaks=count)
 
 
@@ -113,7 +111,7 @@ def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
     """Scores over several captures, whose points are placed side by side beyond the matching distance."""
     apart = [np.array([1000.0 * number, 0, 0, 0]) for number in range(len(pairs))]
     detections, truth = (np.concatenate([pair[i] + a for pair, a in zip(pairs, apart, strict=True)]) for i in (0, 1))
-    score = localization(detections, truth)
+    score = gs.localization(detections, truth)
     return {
         "f1": score.f1,
         "precision": score.precision,
@@ -142,7 +140,7 @@ def picture(rows: list) -> Figure:
     return figure
 
 
-def of_draws(design: Design, number: int, progress: Progress) -> Report:
+def of_draws(design: gs.Design, number: int, progress: gs.Progress) -> Report:
     """The report of draws of beads."""
     results = draws(design, number, progress=progress)
     columns = ("medium", "beads", "draws", "true", "recall", "false", "lateral, um", "axial, um")
@@ -153,8 +151,8 @@ def of_draws(design: Design, number: int, progress: Progress) -> Report:
     return Report({"draws.json": results}, [table(columns, map(cells, results))])
 
 
-def report(design: Path | None, draws: int | None, progress: Progress) -> Report:
-    imaged = read_design(design) if design else geomscope()
+def report(design: Path | None, draws: int | None, progress: gs.Progress) -> Report:
+    imaged = gs.read_design(design) if design else gs.geomscope()
     if draws:
         return of_draws(imaged, draws, progress)
     results = run(imaged, progress=progress)

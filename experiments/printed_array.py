@@ -23,12 +23,10 @@ from matplotlib.patches import Circle
 from scipy.optimize import least_squares
 
 from experiments.common import Report, main, table
-from gs_jax import Imager, MicrolensArray, Sensor, calibrate
-from gs_jax.base.progress import Progress
+from gs_jax import Imager, MicrolensArray, Progress, Sensor, calibrate, read_capture
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
-from gs_jax.calibration.spots import half_light_radii, mean_shift
-from gs_jax.io.captures import read_capture
+from gs_jax.calibration.wide_spots import half_light_radii, mean_shift
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type
@@ -128,7 +126,7 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     # Where a wide spot is depends on the window that looks.
     centers = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
     ones = np.ones(len(centers))
-    two = [mean_shift(image, centers, width * ones, pitch / 2 * ones, pitch / 4 * ones) for width in WINDOWS]
+    two = [mean_shift(image, centers, width * ones, pitch * ones) for width in WINDOWS]
     wide = seen > np.median(seen)
     results = {
         "mirrored": found.mirrored,

@@ -28,11 +28,9 @@ from scipy.ndimage import gaussian_filter
 from experiments.common import Report, cropped, main, table
 from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
-from gs_jax import Grid, Imager, Sensor, Surface, quality, rasterize, read_design
+from gs_jax import Grid, Imager, InputError, Progress, Reconstructor, Sensor, Surface, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
-from gs_jax.reconstruction.pipeline import METHODS, Reconstructor
+from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.surface_fit import fit_sheets
 
 PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)
@@ -44,6 +42,20 @@ RAYS, TILE, APART = 1000, 0.1, 0.02
 
 # Scenes with one depth in each column.
 SHEETS = ("tilted snowflake", "curved leaf", "hemisphere")
+
+# Heading, factor and digits of each number.
+COLUMNS = {
+    "bias_mm": ("depth bias, mm", 1, 3),
+    "sd_mm": ("SD, mm", 1, 3),
+    "within_one_sd": ("within 1 SD", 1, 2),
+    "in_focus_db": ("in focus, dB", 1, 1),
+    "nearest_db": ("3-D, dB", 1, 1),
+    "truth_db": ("of the truth, dB", 1, 1),
+    "shares_db": ("shares, dB", 1, 1),
+    "unrolled_db": ("unrolled, dB", 1, 1),
+    "left": ("left, %", 100, 1),
+    "left_by_one_more": ("one more, %", 100, 1),
+}
 
 Emitters = Float[np.ndarray, "emitter 4"]
 
@@ -225,22 +237,10 @@ def report(design: str, scenes: str, progress: Progress) -> Report:
             image, free = noisy(clean, electrons), name == names[0]
             results.append({"electrons": electrons} | run(image, name, emitters, methods, free, progress))
     slower = [r["time_over_unrolled"] for r in results if "time_over_unrolled" in r][-1]
-    number = lambda value, digits: "" if value is None else f"{value:.{digits}f}"
-    columns = ("scene", "electrons", "depth bias, mm", "SD, mm", "within 1 SD", "in focus, dB", "3-D, dB")
-    columns += ("of the truth, dB", "shares, dB", "unrolled, dB", "left, %", "one more, %", "warned")
-    rows = [
-        [
-            r["scene"],
-            str(r["electrons"]),
-            number(r.get("bias_mm"), 3),
-            number(r.get("sd_mm"), 3),
-            number(r.get("within_one_sd"), 2),
-            *(number(r.get(key), 1) for key in ("in_focus_db", "nearest_db", "truth_db", "shares_db", "unrolled_db")),
-            *(number(100 * r[key], 1) for key in ("left", "left_by_one_more")),
-            "yes" if r["warning"] else "no",
-        ]
-        for r in results
-    ]
+    columns = ("scene", "electrons", *(title for title, _, _ in COLUMNS.values()), "warned")
+    cell = lambda value, factor, digits: "" if value is None else f"{factor * value:.{digits}f}"
+    numbers = lambda r: (cell(r.get(key), *form) for key, (_, *form) in COLUMNS.items())
+    rows = [[r["scene"], str(r["electrons"]), *numbers(r), "yes" if r["warning"] else "no"] for r in results]
     took = f"A fit takes {slower:.1f} times the processor time of the unrolled inversion."
     text = f"# Sheets in ray-traced captures by {design}\n\n{markdown_table(columns, rows)}\n\n{took}\n"
     kept = [{key: value for key, value in r.items() if key != "maps"} for r in results]

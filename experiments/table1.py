@@ -10,12 +10,9 @@ from scipy.optimize import root_scalar
 from scipy.spatial import KDTree
 
 from experiments.common import Report, main, table
-from gs_jax import objectives
+from gs_jax import Design, Progress, geomscope
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
 from gs_jax.design.datasheets import datasheet
-from gs_jax.design.design import Design
-from gs_jax.design.start import geomscope
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 

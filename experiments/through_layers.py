@@ -20,27 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
+import gs_jax as gs
 from experiments.common import Report, main, table
 from experiments.true_image import BLACK, GAIN, scores, strokes
-from gs_jax import (
-    Grid,
-    Imager,
-    Layers,
-    MicrolensArray,
-    Sample,
-    Sensor,
-    calibrate,
-    find_points,
-    forward,
-    localization,
-    psf_model,
-    quality,
-    rasterize,
-    read_capture,
-    reconstruct,
-)
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 
@@ -49,11 +32,11 @@ _FINE, _PLANES, STEPS = 0.012, 2, 20
 CASES = ("with layers", "layers ignored")
 
 
-def scope_of(data: Path, truth: dict) -> Imager:
+def scope_of(data: Path, truth: dict) -> gs.Imager:
     """The device of a capture, with the layers and the sample that its truth lists."""
     device, layers = truth["device"], truth["layers"]
     centers = np.loadtxt(data / "../../geomscope/centers.csv", delimiter=",", skiprows=1)
-    array = MicrolensArray(
+    array = gs.MicrolensArray(
         centers,
         radius_of_curvature=device["R"],
         refractive_index=device["n"],
@@ -61,44 +44,44 @@ def scope_of(data: Path, truth: dict) -> Imager:
         substrate_thickness=device["t"],
         size=(20.0, 20.0),
     )
-    sensor = Sensor((device["N"], device["N"]), device["px"])
-    scope = Imager(array, sensor, device["v"], 3.0)
+    sensor = gs.Sensor((device["N"], device["N"]), device["px"])
+    scope = gs.Imager(array, sensor, device["v"], 3.0)
     (filter_layer, _, cover) = layers["obj"]
     return dataclasses.replace(
         scope,
-        filters=Layers(*np.transpose([filter_layer])),
-        windows=Layers(*np.transpose(layers["img"])),
-        sample=Sample(layers["medium"], truth["sample_begins_mm"], Layers(*np.transpose([cover]))),
+        filters=gs.Layers(*np.transpose([filter_layer])),
+        windows=gs.Layers(*np.transpose(layers["img"])),
+        sample=gs.Sample(layers["medium"], truth["sample_begins_mm"], gs.Layers(*np.transpose([cover]))),
     )
 
 
-def calibrated(data: Path, progress: Progress) -> tuple[dict[str, Imager], dict]:
+def calibrated(data: Path, progress: gs.Progress) -> tuple[dict[str, gs.Imager], dict]:
     """The device as three captures in air give it, with the layers and without; and what the two fits say."""
     in_air = sorted(data.glob("L_cal_*.json"))
     points = np.array([json.loads(path.read_text())["points_mm"][0][:3] for path in in_air])
     scope = scope_of(data, json.loads((data / "L_points.json").read_text()))
-    images = [read_capture(path.with_suffix(".tif"), scope.sensor.shape) for path in in_air]
+    images = [gs.read_capture(path.with_suffix(".tif"), scope.sensor.shape) for path in in_air]
     devices, results = {}, {}
     without = dataclasses.replace(scope, filters=None, windows=None, sample=None)
     for name, start, sample in ((CASES[0], scope, scope.sample), (CASES[1], without, None)):
-        result = calibrate(images, points, dataclasses.replace(start, sample=None), progress=progress)
+        result = gs.calibrate(images, points, dataclasses.replace(start, sample=None), progress=progress)
         devices[name] = dataclasses.replace(result.imager, sample=sample)
         results[name] = {"rms_px": result.rms, "values": result.values, "deviations": result.deviations}
     return devices, results
 
 
-def on_points(data: Path, devices: dict[str, Imager], progress: Progress) -> dict:
+def on_points(data: Path, devices: dict[str, gs.Imager], progress: gs.Progress) -> dict:
     """Detections by each device, and the image by the model of the first."""
     points = np.array(json.loads((data / "L_points.json").read_text())["points_mm"])
     scope = devices[CASES[0]]
-    image = read_capture(data / "L_points.tif", scope.sensor.shape)
+    image = gs.read_capture(data / "L_points.tif", scope.sensor.shape)
     results = {}
     for (name, each), near in zip(devices.items(), (19.8, 16.0), strict=True):
-        grid = Grid.over(each.sensor, depths=np.linspace(near, 24.1, 9), pitch=0.04)
-        found = find_points(image, each, grid, progress=progress)
+        grid = gs.Grid.over(each.sensor, depths=np.linspace(near, 24.1, 9), pitch=0.04)
+        found = gs.find_points(image, each, grid, progress=progress)
         beside = np.hypot(*(found[:, None, :2] - points[None, :, :2]).transpose(2, 0, 1))
         off = found[:, 2] - points[beside.argmin(1), 2]
-        score = localization(found, points)
+        score = gs.localization(found, points)
         results[name] = {
             "points": len(found),
             "f1": score.f1,
@@ -111,25 +94,25 @@ def on_points(data: Path, devices: dict[str, Imager], progress: Progress) -> dic
     return results | {"model": scores(light, electrons(image))}
 
 
-def on_words(data: Path, devices: dict[str, Imager], methods: list[str], progress: Progress) -> dict:
+def on_words(data: Path, devices: dict[str, gs.Imager], methods: list[str], progress: gs.Progress) -> dict:
     """Each device's image of the words, and the volumes of some methods."""
     truth = json.loads((data / "L_words.json").read_text())
-    image = read_capture(data / "L_words.tif", devices[CASES[0]].sensor.shape)
+    image = gs.read_capture(data / "L_words.tif", devices[CASES[0]].sensor.shape)
     emitters = np.concatenate([strokes(plane) for plane in truth["planes"]])
     z = np.unique(emitters[:, 2])
     count = 2 * int(np.ceil(np.abs(emitters[:, :2]).max() / _FINE + 1)) + 1
-    fine = Grid(z, (count, count), _FINE)
+    fine = gs.Grid(z, (count, count), _FINE)
     results = {}
     for name, each in devices.items():
-        model = forward(rasterize(emitters, fine), each, fine, psf_model(each, fine, progress=progress))
+        model = gs.forward(gs.rasterize(emitters, fine), each, fine, gs.psf_model(each, fine, progress=progress))
         results[name] = {"model": scores(np.asarray(model), electrons(image))}
         depths = np.interp(np.arange(_PLANES * (len(z) - 1) + 1) / _PLANES, np.arange(len(z)), z)
         grid = voxel_grid(each, depths.tolist(), pixels=PIXELS_PER_VOXEL)
-        target = np.asarray(rasterize(emitters, grid), np.float32)
-        empty = quality(np.zeros_like(target), target).psnr_db
+        target = np.asarray(gs.rasterize(emitters, grid), np.float32)
+        empty = gs.quality(np.zeros_like(target), target).psnr_db
         for method in methods:
-            volume = reconstruct(image, each, grid, METHODS[method](STEPS), progress=progress)
-            results[name][method] = quality(volume, target).psnr_db - empty
+            volume = gs.reconstruct(image, each, grid, METHODS[method](STEPS), progress=progress)
+            results[name][method] = gs.quality(volume, target).psnr_db - empty
     return results
 
 
@@ -137,7 +120,7 @@ def electrons(image: np.ndarray) -> np.ndarray:
     return GAIN * (image.astype(np.float64) - BLACK)
 
 
-def report(data: Path, methods: str, progress: Progress) -> Report:
+def report(data: Path, methods: str, progress: gs.Progress) -> Report:
     devices, fits = calibrated(data, progress)
     points = on_points(data, devices, progress)
     words = on_words(data, devices, methods.split(","), progress)

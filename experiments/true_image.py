@@ -3,7 +3,7 @@
 The near model has one PSF, that on the axis, within the field radius; the full model has all transmitted light
 (`full_optics`, `full_image_of_points`). One gain per image is fitted, by least squares on its pixels, and nothing else.
 Error is the RMS of the difference over that of the image, correlation is Pearson's, both for the images and for both
-binned by 4 and 16; light is the model's sum over the image's. "Two rings" is the full model with fewer core rings.
+binned by 4 and 16; light is the model's sum over the image's.
 
 - Captures by another group's ray tracer with the authors' array, with noise: letters, a USAF target, 120 points.
 - Other devices, for which nothing was tuned, by `experiments/ray_tracer.py`, which shares no code with `gs_jax`
@@ -26,27 +26,20 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
+import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from experiments.ray_tracer import traced
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import read_design
-from gs_jax.design.start import geomscope
 from gs_jax.geometry import envelope
-from gs_jax.io.captures import read_capture
-from gs_jax.layouts import random_layout
 from gs_jax.lenses import Orientation
 from gs_jax.optics.aberrations import best_focus
 from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.projection.point_sources import full_image_of_points
-from gs_jax.simulation.phantoms import letters, random_points, rasterize
+from gs_jax.simulation.phantoms import letters, random_points
 from gs_jax.simulation.synthetic import simulate_points
 
 BINS = (1, 4, 16)
-# Rings of a full model that costs twice the near one.
-TWO_RINGS = (1.0, 2.5)
 # Captures: electrons per count, and the black level.
 GAIN, BLACK = 10, 16
 
@@ -67,10 +60,10 @@ class Device(NamedTuple):
     orientation: Orientation = "plano"
     conic_constant: float = 0.0
 
-    def imager(self) -> Imager:
+    def imager(self) -> gs.Imager:
         """The imager of the models."""
-        centers = random_layout(self.lenses, (self.plate, self.plate), diameter=self.aperture, seed=1)
-        array = MicrolensArray(
+        centers = gs.random_layout(self.lenses, (self.plate, self.plate), diameter=self.aperture, seed=1)
+        array = gs.MicrolensArray(
             centers,
             self.radius,
             self.refractive_index,
@@ -79,9 +72,9 @@ class Device(NamedTuple):
             orientation=self.orientation,
             conic_constant=self.conic_constant,
         )
-        sensor = Sensor((self.pixels, self.pixels), self.pixel)
-        v = best_focus(Imager(array, sensor, 1.0, self.field_radius), np.mean(self.depths))
-        return Imager(array, sensor, v, self.field_radius)
+        sensor = gs.Sensor((self.pixels, self.pixels), self.pixel)
+        v = best_focus(gs.Imager(array, sensor, 1.0, self.field_radius), np.mean(self.depths))
+        return gs.Imager(array, sensor, v, self.field_radius)
 
 
 DEVICES = {
@@ -107,30 +100,27 @@ def _binned(image, size):
     return image[: rows * size, : columns * size].reshape(rows, size, columns, size).sum((1, 3), dtype=np.float64)
 
 
-def of_volume(emitters: np.ndarray, imager: Imager, pitch: float, image: np.ndarray, progress: Progress) -> dict:
+def of_volume(emitters: np.ndarray, imager: gs.Imager, pitch: float, image: np.ndarray, progress: gs.Progress) -> dict:
     """Scores of the models for planes of emitters, as voxels."""
     depths, count = np.unique(emitters[:, 2]), 2 * math.ceil(np.abs(emitters[:, :2]).max() / pitch + 1) + 1
-    grid = Grid(depths, (count, count), pitch)
-    volume = rasterize(emitters, grid)
+    grid = gs.Grid(depths, (count, count), pitch)
+    volume = gs.rasterize(emitters, grid)
     kernel = psf_of_depth(imager, depths, "geometric")
-    near = forward(volume, imager, grid, jnp.stack([kernel(depth) for depth in depths]))
-    results = {"near": scores(np.asarray(near), image)}
-    for name, rings in (("full", None), ("two rings", TWO_RINGS)):
-        optics = field_varying_psf(imager, depths, rings=rings, progress=progress)
-        results[name] = scores(np.asarray(forward(volume, imager, grid, optics)), image)
-    return results
+    near = gs.forward(volume, imager, grid, jnp.stack([kernel(depth) for depth in depths]))
+    full = gs.forward(volume, imager, grid, field_varying_psf(imager, depths, progress=progress))
+    return {"near": scores(np.asarray(near), image), "full": scores(np.asarray(full), image)}
 
 
-def of_points(points: np.ndarray, imager: Imager, image: np.ndarray, progress: Progress) -> dict:
+def of_points(points: np.ndarray, imager: gs.Imager, image: np.ndarray, progress: gs.Progress) -> dict:
     """Scores of the near and the full model for points."""
     near = simulate_points(points, imager, kind="geometric", progress=progress)
     return {"near": scores(near, image), "full": scores(full_image_of_points(points, imager, progress), image)}
 
 
-def on_captures(data: Path, rays: int, progress: Progress) -> dict:
+def on_captures(data: Path, rays: int, progress: gs.Progress) -> dict:
     """Scores on the ray-traced captures, and of our own tracer on the points, with so many rays."""
-    imager, points = read_design(data / "P1.toml").imager(), points_of(data, "d")
-    electrons = lambda s: GAIN * (read_capture(data / f"P1_{s}.tif", imager.sensor.shape).astype(np.float64) - BLACK)
+    imager, points = gs.read_design(data / "P1.toml").imager(), points_of(data, "d")
+    electrons = lambda s: GAIN * (gs.read_capture(data / f"P1_{s}.tif", imager.sensor.shape).astype(np.float64) - BLACK)
     target = json.loads((data / "f.json").read_text())["elements"]
     words = json.loads((data / "h.json").read_text())["planes"]
     results = {
@@ -171,7 +161,7 @@ def bars(elements: list[dict], depth: float = 18.0, pitch: float = 0.0025) -> np
     return np.concatenate(parts, 1).T
 
 
-def on_device(device: Device, progress: Progress, *, points=25, samples=400_000, point_rays=200_000, rays=8) -> dict:
+def on_device(device: Device, progress: gs.Progress, *, points=25, samples=400_000, point_rays=200_000, rays=8) -> dict:
     """Scores on our tracer's images of points and of three thick letters (none if there are no samples)."""
     imager, size = device.imager(), 0.8 * device.plate
     scene = random_points(points, (size, size), device.depths, seed=3)
@@ -190,7 +180,9 @@ def on_device(device: Device, progress: Progress, *, points=25, samples=400_000,
     return results
 
 
-def zone_departure(imager: Imager, depth: float, size: tuple[float, float], points: int = 20_000) -> dict[str, float]:
+def zone_departure(
+    imager: gs.Imager, depth: float, size: tuple[float, float], points: int = 20_000
+) -> dict[str, float]:
     """Share of a point's light that zones assign to wrong lenses, sum |C_zone - C| / sum C, over random points."""
     rng = np.random.default_rng(0)
     centers = np.asarray(imager.centers)
@@ -210,7 +202,7 @@ def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def run(
-    data: Path | None, devices: dict[str, Device] | None = None, *, rays=50_000, progress: Progress, **sizes
+    data: Path | None, devices: dict[str, Device] | None = None, *, rays=50_000, progress: gs.Progress, **sizes
 ) -> dict:
     """Return scores by image, scene and model; `rays` are for `on_captures`, `sizes` for `on_device`."""
     results = {"the authors' array": on_captures(data, rays, progress)} if data else {}
@@ -219,7 +211,7 @@ def run(
     return results
 
 
-def report(data: Path | None, progress: Progress) -> Report:
+def report(data: Path | None, progress: gs.Progress) -> Report:
     results = run(data, progress=progress)
     columns = ("image of", "scene", "by", *(f"error / correlation, {b} x {b}" for b in BINS), "light")
     rows = []
@@ -228,7 +220,7 @@ def report(data: Path | None, progress: Progress) -> Report:
             for model, score in models.items():
                 cells = ("{error:.3f} / {correlation:.3f}".format(**score[f"bin_{b}"]) for b in BINS)
                 rows.append([name, scene, model, *cells, f"{score['light']:.3f}"])
-    design = geomscope()
+    design = gs.geomscope()
     results["zones"] = zones = zone_departure(design.imager(), 20.0, design.array.size_mm)
     departure = (
         f"Zones of Eq. (2) move {zones['mean']:.0%} of a point's light to other lenses, {zones['worst']:.0%} at most."

@@ -26,16 +26,13 @@ import tifffile
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from gs_jax import simulate
+from gs_jax import Design, Progress, Reconstructor, geomscope, simulate, write_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import Design, write_design
-from gs_jax.design.start import geomscope
 from gs_jax.io.camera import prepare, read_frame
 from gs_jax.io.captures import Selection
 from gs_jax.io.recordings import open_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries
-from gs_jax.reconstruction.pipeline import Reconstructor, voxel_grid
+from gs_jax.reconstruction.pipeline import voxel_grid
 from gs_jax.simulation.phantoms import random_points
 
 # Seconds between two samples of the process; frames whose parts are timed.

@@ -99,7 +99,15 @@ def test_records_of_other_settings_are_refused(tmp_path, text, got):
     "wrong", [{"draws": 0}, {"rays": 0}, {"exposures": [3000, 0]}, {"span": [0.0, 5.0]}, {"span": [18.0, 20.0]}]
 )
 def test_numbers_out_of_range_are_refused_before_anything_is_written(tmp_path, wrong):
-    right = {"designs": [], "span": [18.0, 23.0], "draws": 1, "exposures": [3000], "rays": 10, "images": "rays"}
+    right = {
+        "designs": [],
+        "span": [18.0, 23.0],
+        "draws": 1,
+        "exposures": [3000],
+        "rays": 10,
+        "width": 0.5,
+        "images": "rays",
+    }
     records = tmp_path / "new" / "records.json"
     with pytest.raises(InputError, match="--draws, --exposures and --rays must be 1 or more, and --span"):
         report(**(right | wrong), records=records, progress=Progress())
