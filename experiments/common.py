@@ -24,9 +24,9 @@ from rich.table import Table
 from skimage.feature import peak_local_max
 
 from gs_jax import Design, Grid, Imager, InputError, Progress, Sensor, geomscope, read_design
+from gs_jax.apps.pictures import PALETTE
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.lenses import EACH
-from gs_jax.pictures import PALETTE
 
 # Designs that only experiments use.
 DESIGNS = Path(__file__).parent / "designs"

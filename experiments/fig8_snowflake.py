@@ -28,9 +28,8 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.phantoms import snowflake
 from experiments.true_image import bars, strokes
 from gs_jax.apps.example_pipeline import words
+from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.unet import pretrained
-from gs_jax.pictures import draw_image, label_of
-from gs_jax.simulation.phantoms import snowflake
 from gs_jax.simulation.synthetic import electrons, simulate_points
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))

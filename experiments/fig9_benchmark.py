@@ -30,18 +30,18 @@ from matplotlib.figure import Figure
 
 import gs_jax as gs
 from experiments.common import Report, local_maxima, main, points_of
+from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import render_points, timed
-from gs_jax.detection.particles import find_clusters
+from gs_jax.apps.pictures import draw_image, label_of
+from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.unet import pretrained
 from gs_jax.optics.theory import FWHM
-from gs_jax.pictures import draw_image, label_of
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
-from gs_jax.simulation.phantoms import letters, snowflake
-from gs_jax.solvers.unrolled import read_unrolled
+from gs_jax.reconstruction.networks import read_unrolled
+from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.simulation.phantoms import letters
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")
 STEPS = 20

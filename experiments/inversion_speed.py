@@ -25,8 +25,7 @@ from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.machine import status_mib
 from gs_jax.reconstruction.inverse_problem import prepare_model
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 
 DEPTHS = np.linspace(18.0, 22.0, 9).tolist()
 MODELS = ("near", "full")

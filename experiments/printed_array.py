@@ -26,7 +26,7 @@ from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray, Progress, Sensor, calibrate, read_capture
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
-from gs_jax.calibration.wide_spots import half_light_radii, mean_shift
+from gs_jax.calibration.spots import half_light_radii, mean_shift
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type

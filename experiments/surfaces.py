@@ -30,7 +30,7 @@ from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, InputError, Progress, Reconstructor, Sensor, Surface, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.surface_fit import fit_sheets
 
 PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tomli_w
-from gs_jax.codesign.search import problem_of
 from hypothesis import HealthCheck, given, settings, strategies as st
 from pydantic import ValidationError
 
 from gs_jax import geomscope
 from gs_jax.base.errors import InputError, InputWarning
+from gs_jax.codesign.search import problem_of
 from gs_jax.codesign.study import read_study
 from gs_jax.design.design import Design, read_design, write_design
 from gs_jax.design.start import commented, design_keys
