@@ -19,6 +19,7 @@ from experiments.common import Report, main, table
 from gs_jax import Design, Imager, Progress, geomscope, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
+from gs_jax.mold.lenslets import Part
 from gs_jax.mold.measurement import measure_lenslets, summarize
 from gs_jax.mold.solids import (
     MoldShape,
@@ -55,26 +56,26 @@ def differing(imager: Imager) -> Imager:
 
 def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     """Make the array and the mold at one chord error, write, read back and measure."""
-    array, shape = imager.array, MoldShape(label=label)
+    part, shape = Part(imager.array), MoldShape(label=label)
     started = time.perf_counter()
-    part = array_solid(array, chord_um / 1000)
+    array = array_solid(part, chord_um / 1000)
     made = time.perf_counter() - started
-    mold = mold_solid(array, part, shape)
+    mold = mold_solid(part, array, shape)
     with tempfile.TemporaryDirectory() as folder:
-        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (part, mold)]
+        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (array, mold)]
     volumes = [mesh.solid().volume() for mesh in meshes]
-    block = float(np.prod(np.diff(mold_bounds(array, shape), axis=0)))
-    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(array, shape))
-    cast = cast_solid(array, part, shape).volume()
-    numbers = summarize(measure_lenslets(meshes[1], array), imager)
+    block = float(np.prod(np.diff(mold_bounds(part, shape), axis=0)))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(part, shape))
+    cast = cast_solid(part, array, shape).volume()
+    numbers = summarize(measure_lenslets(meshes[1], part), imager)
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),
         "seconds": made,
-        "array_volume_error": volumes[0] / array_volume(array) - 1,
-        "mold_volume_error": volumes[1] / mold_volume(array, shape) - 1,
+        "array_volume_error": volumes[0] / array_volume(part) - 1,
+        "mold_volume_error": volumes[1] / mold_volume(part, shape) - 1,
         "block_filled_error": (volumes[1] + volumes[0] + engraved) / block - 1,
-        "cast_is_array_error": cast / part.volume() - 1,
+        "cast_is_array_error": cast / array.volume() - 1,
         **numbers,
     }
 

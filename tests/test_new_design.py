@@ -285,9 +285,9 @@ def test_what_is_commented_reads_back(tmp_path):
 
 def test_every_key_is_described():
     for key in design_keys().values():
-        assert key.meaning and key.allowed, key.path
+        assert key.meaning and key.allowed, key.name
         words = {"mm": "mm", "um": "micrometres", "nm": "nanometres", "deg": "degrees", "": ""}
-        assert words[key.unit] in key.allowed, key.path
+        assert words[key.unit] in key.allowed, key.name
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def test_page_of_keys_is_up_to_date():
     text = (DESIGN / "KEYS.md").read_text(encoding="utf-8")
     assert text == module(DESIGN / "keys.py").page()
     for key in design_keys().values():
-        assert f"`{key.name}`" in text or f"[{key.name}]" in text, key.path
+        assert f"`{key.name}`" in text or f"[{key.name}]" in text, key.name
 
 
 def test_drawing_of_keys_is_small(tmp_path, monkeypatch):
