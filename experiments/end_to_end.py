@@ -194,7 +194,7 @@ def reconstruction_loss(
     def one(key):
         scene_key, noise_key = jax.random.split(key)
         truth = random_scene(scene_key, grid, density=density, width=width)
-        image = noisy(noise_key, electrons * jnp.asarray(forward(truth, imager, grid, images)), read_noise)
+        image = noisy(noise_key, jnp.asarray(electrons * forward(truth, imager, grid, images)), read_noise)
         return misfit_db(reconstruct(image, imager, grid, background_width=background_width), truth)
 
     return jnp.mean(lax.map(one, jax.random.split(key, scenes)))
