@@ -1,1 +1,1 @@
-"""Co-design: what is free, what is wanted, and the search for a better microscope."""
+"""Co-design: studies, their terms, and searches for better microscopes."""

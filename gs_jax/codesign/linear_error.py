@@ -46,40 +46,40 @@ from ..optics.pupil import pupil_quadrature
 from ..optics.raytrace import trace_lenslet
 
 # Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
-FILL, LENGTH = 0.03, 0.05
+_FILL, _LENGTH = 0.03, 0.05
 # Read noise, electrons.
-READ_NOISE = 2.0
+_READ_NOISE = 2.0
 # Nodes of the quadrature over frequencies, up to Nyquist of voxels of 40 um.
 _NODES = 16
-# Places along a side of the part of the plate whose points see a whole field of lenses.
-_PLACES = 2
+# Positions along a side of the part of the plate whose points see a whole field of lenses.
+_POSITIONS = 2
 
 
 def volume_error(imager: Imager, at: Conditions) -> Float[Array, ""]:
     """Relative error of volumes by the best linear estimate: the root of the mean of `lost_power` over the depths."""
-    return jnp.sqrt(jnp.mean(lost_power(imager, at, _places(imager))))
+    return jnp.sqrt(jnp.mean(lost_power(imager, at, _positions(imager))))
 
 
-def _places(imager: Imager) -> Float[Array, "place 2"]:
+def _positions(imager: Imager) -> Float[Array, "position 2"]:
     """Four points that stand for the plate, mm: a field radius from its edge, if it is large."""
     plate = finite_plate(imager)
     inner = jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
-    side = jnp.asarray((np.arange(_PLACES) + 0.5) / _PLACES - 0.5, inner.dtype)
+    side = jnp.asarray((np.arange(_POSITIONS) + 0.5) / _POSITIONS - 0.5, inner.dtype)
     return jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * inner[None]
 
 
-def lost_power(imager: Imager, at: Conditions, places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
+def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position 2"]) -> Float[Array, " depth"]:
     """Mean squared error of the best linear estimate over the scene's variance, at each depth: 0 to 1.
 
     Parameters
     ----------
     imager, at
         Lenses of any number of types, and conditions whose depths are the scene's planes.
-    places
+    positions
         `(x, y)` of objects, mm; the result is the mean over them. The lenses around each give its parallax.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    dtype, finest = at.depths.dtype, 1 / (2 * PLACE)
+    dtype, finest = at.depths.dtype, 1 / (2 * _EMITTER_SIDE)
     # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
     object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
     ring = jnp.asarray(weights, dtype) * object_frequency
@@ -88,8 +88,8 @@ def lost_power(imager: Imager, at: Conditions, places: Float[Array, "place 2"]) 
     amplitude = _amplitude(imager, at, frequency, spectrum)
     ways, planes = directions(dtype), jnp.eye(at.depths.size, dtype=dtype)
 
-    def at_place(place):
-        weight, turns = _view(imager, at, place, ways)
+    def at_position(position):
+        weight, turns = _view(imager, at, position, ways)
 
         def at_frequency(frequency, amplitude):
             cos, sin = ((amplitude * weight)[None] * wave(frequency * turns) for wave in (jnp.cos, jnp.sin))
@@ -103,7 +103,7 @@ def lost_power(imager: Imager, at: Conditions, places: Float[Array, "place 2"]) 
 
         return jax.vmap(at_frequency, (0, 2), 1)(frequency, amplitude)
 
-    left = jnp.mean(jax.lax.map(at_place, places), 0)
+    left = jnp.mean(jax.lax.map(at_position, positions), 0)
     share = ring[None] * spectrum
     return jnp.sum(left * share, 1) / jnp.sum(share, 1)
 
@@ -116,9 +116,9 @@ def _amplitude(imager, at, frequency, spectrum) -> Float[Array, "lens depth freq
     return amplitude[..., None] * safe_sqrt(power * spectrum[None])
 
 
-def _view(imager, at, place, ways):
+def _view(imager, at, position, ways):
     """Weights of the lenses `(lens, depth)`, and their images' phase over frequency `(direction, lens, depth)`."""
-    points = jnp.concatenate([jnp.tile(place, (at.depths.size, 1)), at.depths[:, None]], 1)
+    points = jnp.concatenate([jnp.tile(position, (at.depths.size, 1)), at.depths[:, None]], 1)
     views = imager.views_of_all(points)
     weight = safe_sqrt(envelope(jnp.sum(views.offset**2, -1), views.reduced_depth, field_radius(imager, at)))
     return weight, 2 * jnp.pi * jnp.moveaxis((views.spot - imager.centers[:, None]) @ ways, -1, 0)
@@ -132,16 +132,16 @@ def noise_density(imager: Imager, at: Conditions) -> Float[Array, " lens"]:
     """
     own = of_lenses(imager, lit_density(imager, at))
     over = occupancy(imager, at) * jnp.mean(own, 0)
-    return FILL * jnp.sum(own + over[None], 1) + (READ_NOISE / imager.sensor.pixel_pitch) ** 2
+    return _FILL * jnp.sum(own + over[None], 1) + (_READ_NOISE / imager.sensor.pixel_pitch) ** 2
 
 
 def _spectrum(frequency):
     """Power spectrum of random objects with edges, whose correlation falls exponentially (Debye), mm^2."""
-    return FILL * (1 - FILL) * 2 * jnp.pi * LENGTH**2 / (1 + (2 * jnp.pi * LENGTH * frequency) ** 2) ** 1.5
+    return _FILL * (1 - _FILL) * 2 * jnp.pi * _LENGTH**2 / (1 + (2 * jnp.pi * _LENGTH * frequency) ** 2) ** 1.5
 
 
 # Distance and side of the emitter that an exposure is defined by, mm.
-AWAY, PLACE = 20.0, 0.04
+_EMITTER_DISTANCE, _EMITTER_SIDE = 20.0, 0.04
 # Rings of rays: enough for spots twenty periods wide.
 _RINGS = 16
 # Directions of frequencies over half a turn.
@@ -180,12 +180,12 @@ def transfer_power(
         # Rays with total reflection at the rim are missing. Phases are relative to the centroid.
         middle = jnp.sum(lit[:, None] * rays.landing, 0) / jnp.maximum(jnp.sum(lit), 1e-6)
         phase = 2 * jnp.pi * frequencies[:, None, None] * ((rays.landing - middle[None]) @ ways)[None]
-        parts = (jnp.einsum("r,frw->fw", lit, wave(phase)) for wave in (jnp.cos, jnp.sin))
-        return jnp.mean(sum(part**2 for part in parts), 1)
+        real, imaginary = (jnp.einsum("r,frw->fw", lit, wave(phase)) for wave in (jnp.cos, jnp.sin))
+        return jnp.mean(real**2 + imaginary**2, 1)
 
-    found = jax.lax.map(lambda depth: jax.vmap(power, (None, 0))(depth, heights), at.depths)
+    powers = jax.lax.map(lambda depth: jax.vmap(power, (None, 0))(depth, heights), at.depths)
     weight = envelope(heights[None] ** 2, imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
-    mean = jnp.einsum("dh,dhf->df", weight / jnp.sum(weight, 1, keepdims=True), found)
+    mean = jnp.einsum("dh,dhf->df", weight / jnp.sum(weight, 1, keepdims=True), powers)
     cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, clear_diameter(imager, at))
     others = theory.ideal_mtf(frequencies, cutoff) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
     return mean * (others**2)[None]
@@ -196,10 +196,10 @@ def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
     area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
     # In a medium the lens takes a smaller solid angle.
-    return at.exposure.astype(area.dtype) * area * (AWAY / imager.depth_in_medium(at.depths)) ** 2
+    return at.exposure.astype(area.dtype) * area * (_EMITTER_DISTANCE / imager.depth_in_medium(at.depths)) ** 2
 
 
 @by_type
 def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons per mm^2 of the sensor in the image of a lit plane."""
-    return lens_electrons(imager, at) / (PLACE * imager.magnification(at.depths)) ** 2
+    return lens_electrons(imager, at) / (_EMITTER_SIDE * imager.magnification(at.depths)) ** 2

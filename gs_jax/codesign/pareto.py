@@ -27,7 +27,7 @@ from .search import Log, Problem, load, problem_of, run_stages, warn_of_start
 from .study import Row, Study, TermTable
 from .terms import SIGNS, unit_of, with_terms
 
-# Relative gain of the goal below which two searches have found the same design.
+# Relative gain of the goal below which two searches count as having the same result.
 _LEAST_GAIN = 1e-6
 
 

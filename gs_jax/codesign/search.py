@@ -120,7 +120,7 @@ class Residuals(eqx.Module):
 
     def __call__(self, free: Values, key: Key[Array, ""]) -> Float[Array, " entry"]:
         new = candidate(self.imager, self.at, self.parameters(free))
-        return jnp.concatenate([one.residual(*new, key, margin=self.margin) for one in self.objectives])
+        return jnp.concatenate([objective.residual(*new, key, margin=self.margin) for objective in self.objectives])
 
 
 class Stage(NamedTuple):
@@ -152,7 +152,7 @@ class Stage(NamedTuple):
     def worst(self, free: Values) -> list[float]:
         """The worst entry of each term."""
         own = self.residuals
-        functions = tuple(one.term for one in own.objectives)
+        functions = tuple(objective.term for objective in own.objectives)
         entries = _entries(own.imager, own.at, functions, own.parameters(free), self.stepper.key)
         return [term.worst(x) for term, x in zip(self.terms, entries, strict=True)]
 
@@ -329,13 +329,13 @@ def load(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple[D
     """
     check_kind("design", design, Design | str | os.PathLike, "a Design or its file")
     check_kind("study", study, Study | str | os.PathLike, "a Study or its file")
-    found = design if isinstance(design, Design) else read_design(design)
+    parent = design if isinstance(design, Design) else read_design(design)
     if isinstance(study, Study):
-        yield initial_design(found, study), study
+        yield initial_design(parent, study), study
         return
     question = read_study(study)
     with errors_name_file(study):
-        yield initial_design(found, question), question
+        yield initial_design(parent, question), question
 
 
 def run_study(
@@ -450,12 +450,12 @@ def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, 
     """
     head, _, state = check_input(path).read_bytes().partition(b"\n")
     try:
-        found = json.loads(head)
-        if found["format"] != _FORMAT:
-            if str(found["format"]).startswith("gs-jax checkpoint"):
+        content = json.loads(head)
+        if content["format"] != _FORMAT:
+            if str(content["format"]).startswith("gs-jax checkpoint"):
                 raise InputError(f"{path}: a checkpoint of another version, which cannot be resumed.")
             raise ValueError
-        log, owner = Log(**found["log"]), found["of"]
+        log, owner = Log(**content["log"]), content["of"]
         if not isinstance(log.steps, list) or not isinstance(log.ends, list):
             raise TypeError
     except (ValueError, KeyError, TypeError) as error:

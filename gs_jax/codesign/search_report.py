@@ -123,15 +123,15 @@ def picture(outcome: Outcome) -> Figure:
     asked = outcome.study.terms
     best = lambda stage: outcome.log.best_end(stage)["start"]
     steps = [step for step in outcome.log.steps if step["start"] == best(step["stage"])]
-    places = np.arange(1, len(steps) + 1)
-    cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")
+    numbers = np.arange(1, len(steps) + 1)
+    cost.semilogy(numbers, [max(step["cost"], 1e-12) for step in steps], "k")
     cost.set(xlabel="step", ylabel="cost", title="cost of the best start")
     for number, (term, label) in enumerate(zip(asked, labels(asked, outcome.study), strict=True)):
         values = np.array([step.get(label, np.nan) for step in steps], float)
         style = "-" if term.is_goal else ("--", ":")[number >= len(PALETTE)]
         text = f"{TERMS[term.name].meaning}\n{target_text(term)} {unit_of(term.name)}"
         color = PALETTE[number % len(PALETTE)]
-        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=color, label=text)
+        terms.plot(numbers, np.maximum(values / term.target, 1e-3), style, color=color, label=text)
     terms.axhline(1, color="0.6", lw=0.8)
     terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
     terms.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -1,4 +1,4 @@
-"""Study files: what is free, what is wanted, and how it is searched for, as TOML.
+"""Study files, TOML: the free parameters, the terms with their targets, and the solvers.
 
 design = "../geomscope.toml"            # to start from; `gs-jax optimize` takes its own
 name = "geomscope-optimized"
@@ -80,13 +80,12 @@ class TermTable(Table):
     weight: Positive = Field(default=1.0, description="a positive number")
 
     @model_validator(mode="after")
-    def _says_one_thing(self) -> "TermTable":
+    def _check_target(self) -> "TermTable":
         check_term(self.name)
-        found = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(found) != 1:
-            raise ValueError(
-                f"{self.name}: one of {', '.join(KINDS)} must be given, got {' and '.join(found) or 'none'}"
-            )
+        kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(kinds) != 1:
+            got = " and ".join(kinds) or "none"
+            raise ValueError(f"{self.name}: one of {', '.join(KINDS)} must be given, got {got}")
         return self
 
     @property
@@ -141,11 +140,11 @@ class LimitTable(Table):
     at_least: tuple[Positive, ...] | None = Field(default=None, strict=False, description="positive numbers")
 
     @model_validator(mode="after")
-    def _says_one_thing(self) -> "LimitTable":
+    def _check_target(self) -> "LimitTable":
         check_term(self.name)
         if bool(self.at_most) == bool(self.at_least):
-            found = "both" if self.at_most else "neither"
-            raise ValueError(f"{self.name}: one of at_most and at_least must be given, got {found}")
+            got = "both" if self.at_most else "neither"
+            raise ValueError(f"{self.name}: one of at_most and at_least must be given, got {got}")
         return self
 
     @property
@@ -305,15 +304,15 @@ def initial_design(design: Design, study: Study) -> Design:
         design = design.replace(orientation=study.orientation)
     if study.types is None:
         return design
-    found = design.imager().array.type_count
-    if found == study.types:
+    count = design.imager().array.type_count
+    if count == study.types:
         return design
-    if found > 1:
-        raise InputError(f"`types` must be {found}, as the design's lens types, or be left out, got {study.types}.")
+    if count > 1:
+        raise InputError(f"`types` must be {count}, as the design's lens types, or be left out, got {study.types}.")
     if design.lens.focal_length_mm is not None:
         raise InputError("`types` needs a design without `lens.focal_length_mm`.")
-    if study.types > (count := len(design.array.centers_mm)):
-        raise InputError(f"`types` must be at most {count}, the number of lenses, got {study.types}.")
+    if study.types > (lenses := len(design.array.centers_mm)):
+        raise InputError(f"`types` must be at most {lenses}, the number of lenses, got {study.types}.")
     radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.types)
     which = interleave(np.array(design.array.centers_mm), study.types)
     lens = design.lens.model_copy(update={"radius_of_curvature_mm": tuple(radius[which].tolist())})

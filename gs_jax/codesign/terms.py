@@ -105,7 +105,9 @@ TERMS: dict[str, Term] = {
     "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0]),
     "spacing_mm": Term("distance of nearest lenses", _of_imager(objectives.spacing)),
     "min_wall_mm": Term("mask left between neighbouring apertures", _of_imager(objectives.aperture_gap)),
-    "hole_mm": Term("distance of a place on the plate from a lens", _of_imager(objectives.uncovered_distance)),
+    "hole_mm": Term(
+        "distance of a point of the plate from the nearest lens", _of_imager(objectives.uncovered_distance)
+    ),
     "coverage": Term("share of the plate that is clear aperture", objectives.coverage),
     "sag_mm": Term("height of a whole lens", objectives.sag),
     "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error),

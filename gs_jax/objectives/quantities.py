@@ -321,31 +321,31 @@ def fwhm(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
         pupil = axial_pupil(imager, depth, radius=radius)
         by_rays = _width_by_rays(pupil)
         narrow = _WIDE * jnp.maximum(pixel, theory.FWHM * airy)
-        places = (narrow + pixel) * jnp.linspace(0, 1, _RADII, dtype=narrow.dtype)
+        positions = (narrow + pixel) * jnp.linspace(0, 1, _RADII, dtype=narrow.dtype)
         # Dense in the middle: the core may be much smaller than a pixel.
-        irradiance = axial_irradiance(imager, pupil, places**2 / places[-1])
-        by_waves = _outermost_half(places, _over_pixels(places, irradiance, pixel))
+        irradiance = axial_irradiance(imager, pupil, positions**2 / positions[-1])
+        by_waves = _outermost_half(positions, _over_pixels(positions, irradiance, pixel))
         return jnp.where(by_rays > narrow, by_rays, by_waves)
 
     return jax.lax.map(on_sensor, at.depths) / imager.magnification(at.depths)
 
 
-def _over_pixels(places, irradiance, pixel) -> Float[Array, " place"]:
-    """Light in square pixels whose middles are at places along an axis, of a round image given at places squared.
+def _over_pixels(positions, irradiance, pixel) -> Float[Array, " position"]:
+    """Light in square pixels whose middles are at positions along an axis, of a round image given at positions squared.
 
     The circle of each radius has an arc within the pixel, which is exact: images may be much smaller than a pixel, or
     larger.
     """
-    half, count, last = pixel / 2, irradiance.shape[0], places[-1]
+    half, count, last = pixel / 2, irradiance.shape[0], positions[-1]
     # Radii that meet the pixel, dense at the lower end, where the middle of the image may be.
-    low, high = jnp.maximum(places - math.sqrt(2) * half, 0), jnp.minimum(places + math.sqrt(2) * half, last)
-    t = jnp.asarray((np.arange(_ARCS) + 0.5) / _ARCS, places.dtype)[None]
+    low, high = jnp.maximum(positions - math.sqrt(2) * half, 0), jnp.minimum(positions + math.sqrt(2) * half, last)
+    t = jnp.asarray((np.arange(_ARCS) + 0.5) / _ARCS, positions.dtype)[None]
     span = (high - low)[:, None]
     radius = low[:, None] + span * t**2
     index = (count - 1) * jnp.sqrt(radius / last)
     floor = jnp.minimum(jnp.floor(index), count - 2)
     below, above = (irradiance[floor.astype(int) + step] for step in (0, 1))
-    first, end = (_arccos((places[:, None] + side) / radius) for side in (half, -half))
+    first, end = (_arccos((positions[:, None] + side) / radius) for side in (half, -half))
     side = jnp.pi / 2 - _arccos(half / radius)
     arc = jnp.maximum(jnp.minimum(end, side) - first, 0) + jnp.maximum(end - jnp.maximum(first, jnp.pi - side), 0)
     return jnp.sum(arc * (below + (index - floor) * (above - below)) * radius * span * t, 1)
@@ -363,10 +363,10 @@ def _width_by_rays(pupil: AxialPupil) -> Float[Array, ""]:
     mean = jnp.sum(share * squared) / jnp.maximum(jnp.sum(share), _NOTHING)
 
     def width_squared(reach, blur):
-        places = reach * jnp.linspace(0, 1, _RADII, dtype=share.dtype)
+        positions = reach * jnp.linspace(0, 1, _RADII, dtype=share.dtype)
         gauss = lambda apart: jnp.exp(-((apart / blur) ** 2) / 2)
-        away, mirrored = (places[:, None] + sign * squared[None] for sign in (-1, 1))
-        return _outermost_half(places, jnp.sum(share[None] * (gauss(away) + gauss(mirrored)), 1)) / 2
+        away, mirrored = (positions[:, None] + sign * squared[None] for sign in (-1, 1))
+        return _outermost_half(positions, jnp.sum(share[None] * (gauss(away) + gauss(mirrored)), 1)) / 2
 
     # Stray light makes the mean large: the core shows once the blur is small beside it.
     finer = lambda width, _: (width_squared(2 * width, _FINE * width), None)
@@ -374,13 +374,13 @@ def _width_by_rays(pupil: AxialPupil) -> Float[Array, ""]:
     return 2 * safe_sqrt(jax.lax.scan(finer, first, length=_PASSES)[0])
 
 
-def _outermost_half(places, profile) -> Float[Array, ""]:
+def _outermost_half(positions, profile) -> Float[Array, ""]:
     """Twice the largest radius at which a profile has half of its maximum; linear between radii."""
     half = jnp.max(profile) / 2
     last = jnp.minimum(jnp.max(jnp.where(profile >= half, jnp.arange(len(profile)), 0)), len(profile) - 2)
     high, low = profile[last], profile[last + 1]
     part = (high - half) / jnp.where(high > low, high - low, 1)
-    return 2 * (places[last] + part * (places[last + 1] - places[last]))
+    return 2 * (positions[last] + part * (positions[last + 1] - positions[last]))
 
 
 @best_type
