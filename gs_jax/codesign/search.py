@@ -108,12 +108,6 @@ class Residuals(eqx.Module):
     objectives: tuple[Objective, ...]
     margin: Float[Array, ""] = eqx.field(converter=as_float)
 
-    @eqx.filter_jit
-    def free(self, values: Values) -> Values:
-        """The solver's variables of parameters."""
-        return inverse(self.transforms, values)
-
-    @eqx.filter_jit
     def parameters(self, free: Values) -> Values:
         """All parameters, by the solver's variables."""
         return self.values | forward(self.transforms, free)
@@ -158,7 +152,7 @@ class Stage(NamedTuple):
 
     def begin(self, values: Values) -> State:
         """The state at parameters."""
-        return self.stepper.begin(self.residuals.free(values))
+        return self.stepper.begin(inverse(self.residuals.transforms, values))
 
     def run(self, start: int, state: State, steps: list[dict[str, Any]], each: Callable[[State], None]):
         """Run a start from its state, add a record for each step, and return that of its end."""

@@ -86,11 +86,13 @@ class Sigmoid(Affine):
 Transforms = dict[str, Transform]
 
 
+@eqx.filter_jit
 def forward(transforms: Transforms, free: Values) -> Values:
     """The values of free variables, by name."""
     return {name: transform.forward(free[name]) for name, transform in transforms.items()}
 
 
+@eqx.filter_jit
 def inverse(transforms: Transforms, values: Values) -> Values:
     """The free variables of values, by name; other values are left out."""
     return {name: transform.inverse(values[name]) for name, transform in transforms.items()}
