@@ -19,7 +19,7 @@ from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.solve import LBFGSB
 from gs_jax.objectives.conditions import Conditions, of_lenses, per_type
 
-from .helpers import compilations
+from .helpers import compilations, quantities
 
 DEPTHS = np.array([18.0, 20.0, 22.0])
 
@@ -153,72 +153,66 @@ BLUR = cast(Any, objectives.blur)
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("changes", "words"),
     [
-        (lambda: UNCHECKED(in_focus, gs.geomscope(), free=FREE), "imager must be an Imager, as .*, got "),
+        ({"imager": gs.geomscope()}, "imager must be an Imager, as .*, got "),
+        ({"imager": gs.Imager}, "imager must be an Imager, as .*, got "),
+        ({"free": "shift"}, "free must be a Free, as `gs_jax.free` makes it, got 'shift'"),
+        ({"free": gs.free("tilt")}, "tilt must be a number of the imager"),
+        ({"solver": "bfgs"}, "solver must be a solver of .*, got 'bfgs'"),
+        ({"solver": optx.BFGS}, "solver must be a solver of .*BFGS"),
+        ({"solver": LBFGSB()}, "got none of sensor_distance"),
+        ({"steps": 0}, "steps must be 1 or more, got 0"),
+        ({"steps": np.nan}, "steps must be a whole number, got nan"),
+        ({"loss": None}, "loss must be a function of an imager, got None"),
+        ({"loss": lambda s: s.sensor_distance > 5}, "must return one number or array of floating point, got bool"),
         (
-            lambda: UNCHECKED(in_focus, small(), free="shift"),
-            "free must be a Free, as `gs_jax.free` makes it, got 'shift'",
-        ),
-        (
-            lambda: UNCHECKED(in_focus, small(), free=FREE, solver="bfgs"),
-            "solver must be a solver of .*, got 'bfgs'",
-        ),
-        (lambda: gs.optimize(in_focus, small(), free=FREE, steps=0), "steps must be 1 or more, got 0"),
-        (lambda: UNCHECKED(in_focus, small(), free=FREE, steps=np.nan), "steps must be a whole number, got nan"),
-        (lambda: UNCHECKED(None, small(), free=FREE), "loss must be a function of an imager, got None"),
-        (lambda: UNCHECKED(in_focus, small(), free=FREE, solver=optx.BFGS), "solver must be a solver of .*BFGS"),
-        (lambda: BLUR(gs.Imager, DEPTHS), "imager must be an Imager, as .*, got <class"),
-        (lambda: BLUR(small(), 1j * DEPTHS), "depths must be real lengths, mm, or Conditions, got array"),
-        (lambda: BLUR(small(), Conditions), "depths must be real lengths, mm, or Conditions, got <class"),
-        (lambda: RUN_STUDY(gs.Design, "s.toml"), "design must be a Design or its file, got <class"),
-        (lambda: gs.free("spacing"), "names must be among sensor_distance, rotation.*, got 'spacing'"),
-        (lambda: gs.free(), "at least one name must be given"),
-        (
-            lambda: gs.optimize(in_focus, small(), free=gs.free("tilt")),
-            "tilt must be a number of the imager",
-        ),
-        (
-            lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"shift": (0, 1)}),
-            "among the free .*, got shift",
-        ),
-        (lambda: gs.optimize(in_focus, small(), free=FREE, solver=LBFGSB()), "got none of sensor_distance"),
-        (
-            lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"sensor_distance": (6.0, 5.0)}),
-            "bounds of sensor_distance must be finite, the lower one first, got 6.0 to 5.0",
-        ),
-        (
-            lambda: UNCHECKED(lambda s: s.sensor_distance > 5, small(), free=FREE),
-            "loss must return one number or array of floating point, got bool",
-        ),
-        (lambda: UNCHECKED(in_focus, gs.Imager, free=FREE), "imager must be an Imager, as .*, got "),
-        (
-            lambda: gs.optimize(lambda s: s.wavelength, small(), free=FREE, solver=optx.LevenbergMarquardt(1e-3, 1e-3)),
+            {"loss": lambda s: s.wavelength, "solver": optx.LevenbergMarquardt(1e-3, 1e-3)},
             "LevenbergMarquardt needs residuals, an array, got a scalar",
+        ),
+        ({"bounds": {"shift": (0, 1)}}, "among the free .*, got shift"),
+        (
+            {"bounds": {"sensor_distance": (6.0, 5.0)}},
+            "bounds of sensor_distance must be finite, .*, got 6.0 to 5",
         ),
     ],
 )
-def test_what_cannot_be_searched_is_refused(make, words):
+def test_what_cannot_be_searched_is_refused(changes, words):
     with pytest.raises(InputError, match=words):
-        make()
+        UNCHECKED(**({"loss": in_focus, "imager": small(), "free": FREE} | changes))
 
 
-OBJECTIVES = {
-    "spot_width": objectives.spot_width,
-    "encircled_radius": objectives.encircled_radius,
-    "half_light_radius": objectives.half_light_radius,
-    "width_per_light": objectives.width_per_light,
-    "strehl": objectives.strehl,
-    "lateral_resolution": objectives.lateral_resolution,
-    "axial_resolution": objectives.axial_resolution,
-    "depth_of_field": objectives.depth_of_field,
-    "blur": objectives.blur,
-    "occupancy": objectives.occupancy,
-    "light": objectives.light,
-    "lenses_per_point": lambda scope, depths: objectives.lenses_per_point(scope),
-    "coverage": lambda scope, depths: objectives.coverage(scope),
-    "spacing": lambda scope, depths: objectives.spacing(scope),
-}
+@pytest.mark.parametrize(
+    ("function", "arguments", "words"),
+    [
+        (BLUR, (gs.Imager, DEPTHS), "imager must be an Imager, as .*, got <class"),
+        (BLUR, (small(), 1j * DEPTHS), "depths must be real lengths, mm, or Conditions, got array"),
+        (BLUR, (small(), Conditions), "depths must be real lengths, mm, or Conditions, got <class"),
+        (RUN_STUDY, (gs.Design, "s.toml"), "design must be a Design or its file, got <class"),
+        (gs.free, ("spacing",), "names must be among sensor_distance, rotation.*, got 'spacing'"),
+        (gs.free, (), "at least one name must be given"),
+    ],
+)
+def test_wrong_arguments_are_named(function, arguments, words):
+    with pytest.raises(InputError, match=words):
+        function(*arguments)
+
+
+OBJECTIVES = (
+    "spot_width",
+    "encircled_radius",
+    "half_light_radius",
+    "width_per_light",
+    "strehl",
+    "lateral_resolution",
+    "axial_resolution",
+    "depth_of_field",
+    "blur",
+    "occupancy",
+    "light",
+    "lenses_per_point",
+    "coverage",
+)
 
 
 def with_numbers(numbers) -> gs.Imager:
@@ -229,7 +223,8 @@ def with_numbers(numbers) -> gs.Imager:
 @jax.jit
 def everything(numbers):
     """All objectives at once: compiled once."""
-    return {name: objective(with_numbers(numbers), DEPTHS) for name, objective in OBJECTIVES.items()}
+    imager = with_numbers(numbers)
+    return {"spacing": objectives.spacing(imager)} | quantities(imager, DEPTHS, OBJECTIVES)
 
 
 def test_objectives_have_the_gradients_of_finite_differences():

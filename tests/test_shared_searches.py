@@ -25,6 +25,7 @@ pytestmark = pytest.mark.integration
 
 __all__ = ["two"]
 
+START = geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4)
 SEVERAL = Study.model_validate(
     STUDY
     | {
@@ -50,17 +51,11 @@ def assert_same(found, wanted):
 
 @pytest.fixture(scope="module")
 def alone():
-    return run_study(geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4), SEVERAL)
+    return run_study(START, SEVERAL)
 
 
 def test_starts_of_a_search(two, alone, tmp_path):
-    found = run_study(
-        geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4),
-        SEVERAL,
-        workers=two,
-        checkpoint=tmp_path / "c",
-    )
-    assert_same(found, alone)
+    assert_same(run_study(START, SEVERAL, workers=two, checkpoint=tmp_path / "c"), alone)
 
 
 class Interrupted(Progress):
@@ -80,37 +75,18 @@ class Interrupted(Progress):
 
 @pytest.mark.parametrize("first, then", [(True, False), (False, True), (True, True)])
 def test_an_interrupted_search_goes_on_whoever_runs_it(two, alone, tmp_path, first, then):
-    how = {"checkpoint": tmp_path / "c", "every": 0.0}
+    options = {"checkpoint": tmp_path / "c", "every": 0.0}
     with pytest.raises(KeyboardInterrupt):
-        run_study(
-            geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4),
-            SEVERAL,
-            progress=Interrupted(),
-            workers=two if first else None,
-            **how,
-        )
-    again = run_study(
-        geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4),
-        SEVERAL,
-        resume=True,
-        workers=two if then else None,
-        **how,
-    )
-    assert_same(again, alone)
+        run_study(START, SEVERAL, progress=Interrupted(), workers=two if first else None, **options)
+    assert_same(run_study(START, SEVERAL, resume=True, workers=two if then else None, **options), alone)
 
 
 def test_points_of_a_front(two):
     limits = {"pareto": [{"name": "depth_of_field_mm", "at_least": [3.0, 6.0, 9.0, 12.0]}]}
     study, sizes = Study.model_validate(STUDY | limits), []
-    found = trade_off(
-        geomscope().replace(aperture_diameter_mm=1.4),
-        study,
-        workers=two,
-        each=lambda front: sizes.append(len(front.points)),
-    )
-    np.testing.assert_allclose(
-        found.values, trade_off(geomscope().replace(aperture_diameter_mm=1.4), study).values, rtol=1e-9
-    )
+    start = geomscope().replace(aperture_diameter_mm=1.4)
+    found = trade_off(start, study, workers=two, each=lambda front: sizes.append(len(front.points)))
+    np.testing.assert_allclose(found.values, trade_off(start, study).values, rtol=1e-9)
     assert sizes == [1, 2, 3, 4] and len(as_json(found)["points"]) == 4
 
 
