@@ -382,13 +382,6 @@ def test_the_mold_is_sound_and_the_cast_fills_it(part, solid, shape):
     np.testing.assert_allclose(mold.volume() + cast.volume() + engraved, block, rtol=1e-12)
 
 
-def test_shrinkage_is_made_up_for(part, solid):
-    cast = cast_solid(part, solid, MoldShape(shrinkage=0.02))
-    np.testing.assert_allclose(cast.volume() * 0.98**3, solid.volume(), rtol=1e-12)
-    # A point of the cast returns to its place when it shrinks about the origin.
-    np.testing.assert_allclose(np.array(cast.bounding_box()) * 0.98, solid.bounding_box(), rtol=1e-12)
-
-
 def test_the_walls_open_by_the_draft(part, solid):
     shape = MoldShape(draft=0.1, headroom=0.5, marks=False)
     mold, high = mold_solid(part, solid, shape), mold_bounds(part, shape)[1]

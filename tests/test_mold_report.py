@@ -245,11 +245,6 @@ def test_the_picture_of_a_turned_part_has_the_designs_y():
         assert list(axes.images[0].get_extent()) == [-2, 2, bottom, -bottom]
 
 
-def test_a_single_lens_is_made(tmp_path):
-    report = make_mold(design(array={"centers_mm": [[0.1, 0.0]]}), tmp_path / "a.stl", chord=6e-3)
-    assert report["verification"]["lenses_measured"] == 1
-
-
 def test_the_experiment_runs_small():
     small = design()
     (record,) = mold_check.run(small, chords_um=(2.0,))

@@ -18,7 +18,6 @@ from ..design.validation import reach
 from ..geometry import Imager
 from ..io.provenance import Provenance
 from ..io.toml import one_line
-from ..layers import Layers
 from ..lenses import EACH, MicrolensArray
 from ..materials import index_of
 from .fit import Calibration
@@ -95,22 +94,18 @@ def with_sample(design: Design, imager: Imager, name: str | None) -> Design:
     sample, wavelength = imager.sample, 1e6 * float(imager.wavelength)
     before = default_sample(design) if name is None else sample_table(design, name)
     assert sample is not None
-    found = sample_tables(sample)
+    table = sample_tables(sample)
     if np.isclose(index_of(before.refractive_index, wavelength), float(sample.refractive_index), rtol=1e-6):
-        found["refractive_index"] = before.refractive_index
-    if _alike(layers_of(before.layers[::-1], wavelength), sample.layers):
-        found["layers"] = before.model_dump()["layers"]
+        table["refractive_index"] = before.refractive_index
+    first, second = layers_of(before.layers[::-1], wavelength), sample.layers
+    if first is not None and second is not None and len(first.thickness) == len(second.thickness):
+        if np.allclose(np.array(first.slabs), np.array(second.slabs), rtol=1e-6):
+            table["layers"] = before.model_dump()["layers"]
     kept = design.layers.object[: 0 if imager.filters is None else len(imager.filters.thickness)]
     layers = design.layers.model_copy(update={"object": kept})
     if name in design.samples:
-        return design.replace(layers=layers, samples={**design.samples, name: found})
-    return design.replace(layers=layers, sample=found)
-
-
-def _alike(one: Layers | None, other: Layers | None) -> bool:
-    if one is None or other is None or len(one.thickness) != len(other.thickness):
-        return False
-    return np.allclose(np.array(one.slabs), np.array(other.slabs), rtol=1e-6)
+        return design.replace(layers=layers, samples={**design.samples, name: table})
+    return design.replace(layers=layers, sample=table)
 
 
 def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:

@@ -276,8 +276,8 @@ def _add_change_by_window(result: Calibration, search: _Search, initial: Initial
 def _drop_unseen_lenses(result: Calibration) -> Calibration:
     seen, lenses = np.unique(result.spots.lenses, return_inverse=True)
     array = result.imager.array
-    numbers = {name: value[seen] if (value := getattr(array, name)).ndim else value for name in EACH}
-    array = dataclasses.replace(array, centers=array.centers[seen], **numbers)
+    numbers = {name: np.asarray(array.of_lenses(name))[seen] for name in EACH}
+    array = dataclasses.replace(array, centers=np.asarray(array.centers)[seen], types=None, **numbers)
     imager = eqx.tree_at(lambda i: i.array, result.imager, array)
     return result._replace(imager=imager, spots=result.spots._replace(lenses=lenses))
 

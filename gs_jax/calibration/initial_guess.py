@@ -131,7 +131,7 @@ def match_pattern(
         return best
     # Least squares over the spots on lenses.
     nearest = _nearest_lens(p, best.factor, best.shift, tree, best.mirrored, radius)
-    distance, lens = (np.asarray(part)[0] for part in nearest)
+    distance, lens = (np.asarray(values)[0] for values in nearest)
     use = distance < radius
     lenses = (c.conj() if best.mirrored else c)[lens[use]]
     factor, moved = np.linalg.lstsq(np.stack([lenses, np.ones_like(lenses)], -1), p[use])[0]
@@ -437,7 +437,10 @@ def classify_lenses(
             logs = np.log(np.where(total > 0, total, np.nan)) - np.log(np.maximum(expected, _LEAST_LIGHT))
             off[:, number, square, seen] = logs
     off = off[:, np.isfinite(off).any((0, 2, 3))]
-    cost = lambda factors: np.nansum(np.abs(off - factors[..., None]), (1, 2))
+
+    def cost(factors) -> np.ndarray:
+        return np.nansum(np.abs(off - factors[..., None]), (1, 2))
+
     solutions = []
     # Alternate between types and factors, starting from each lens as each type.
     for number, lens in np.ndindex(len(imagers), count):

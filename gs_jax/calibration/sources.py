@@ -56,35 +56,34 @@ class Sources(NamedTuple):
 
         Also if the known coordinates cannot determine what is to be fitted, whatever the spots are.
         """
-        x_y, depths = self.points[:, :2], self.points[:, 2]
-        begins, of_sample = float(imager.sample_surface), imager.sample is not None
-        of_depth = [name for name in ("sensor_distance", "depth_offset") if name in fit]
+        for fault in self._faults(count, imager, fit, blurred):
+            raise InputError(f"positions: {fault}.")
+
+    def _faults(self, count, imager: Imager, fit, blurred) -> Iterator[str]:
+        x_y, depths, begins = self.points[:, :2], self.points[:, 2], float(imager.sample_surface)
         without = sorted(set(range(count)) - set(self.captures.tolist()))
-        outside = self.captures[(self.captures < 0) | (self.captures >= count)]
-        fault = ""
         if not count or without or len(self.points) != len(self.captures):
             which = f", none in capture {without[0] + 1}" if without else ""
             got = f"got {len(self.points)} sources for {count} captures{which}"
-            fault = f"every capture needs one or more sources, {got}"
-        elif len(outside):
-            fault = f"captures are numbered 1 to {count}, got a source in capture {outside[0] + 1}"
-        elif (depths <= 0).any():
-            fault = f"depths must be positive, got {np.nanmin(depths):g} mm"
+            yield f"every capture needs one or more sources, {got}"
+        for number in self.captures[(self.captures < 0) | (self.captures >= count)]:
+            yield f"captures are numbered 1 to {count}, got a source in capture {number + 1}"
+        if (depths <= 0).any():
+            yield f"depths must be positive, got {np.nanmin(depths):g} mm"
         # Where the sample begins may be a guess.
-        elif "sample_at" not in fit and (depths < begins * (1 - 1e-6)).any():
-            begin = f"{begins:g} mm, where the {'sample begins' if of_sample else 'filters end'}, or more"
-            fault = f"depths must be {begin}, got {np.nanmin(depths):g} mm"
-        elif of_depth and np.isnan(depths).all():
+        if "sample_at" not in fit and (depths < begins * (1 - 1e-6)).any():
+            where = f"{begins:g} mm, where the {'filters end' if imager.sample is None else 'sample begins'}"
+            yield f"depths must be {where}, or more, got {np.nanmin(depths):g} mm"
+        of_depth = [name for name in ("sensor_distance", "depth_offset") if name in fit]
+        if of_depth and np.isnan(depths).all():
             remedy = f"give the depth of a source, or hold {of_depth[0]}"
-            fault = f"no known depth to fit {' and '.join(of_depth)} by; {remedy}"
-        elif "shift" in fit and np.isnan(x_y).any(1).all():
-            fault = "no source with known x and y to fit shift by; give x and y of a source, or hold shift"
+            yield f"no known depth to fit {' and '.join(of_depth)} by; {remedy}"
+        if "shift" in fit and np.isnan(x_y).any(1).all():
+            yield "no source with known x and y to fit shift by; give x and y of a source, or hold shift"
         for number in blurred:
-            if (several := int((self.captures == number).sum())) != 1 and not fault:
+            if (several := int((self.captures == number).sum())) != 1:
                 needs = f"capture {number + 1} must have one source, as each lens has one image in it"
-                fault = f"{needs}, got {several}"
-        if fault:
-            raise InputError(f"positions: {fault}.")
+                yield f"{needs}, got {several}"
 
 
 class Spots(NamedTuple):

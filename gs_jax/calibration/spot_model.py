@@ -242,8 +242,11 @@ def _predict(imager: Imager, points, lenses, offsets: CoreOffsets, sharp) -> Flo
     # The middles of blurred spots are on chief rays, at any field.
     offset = jnp.where(jnp.asarray(sharp)[..., None], views.offset, 0)
     field2 = jnp.sum(offset**2, -1) / imager.field_radius**2
-    of_type = jax.vmap(lambda column: jnp.interp(points[:, 2], offsets.depths, column))
-    at = lambda columns: of_type(columns)[offsets.type_of[lenses], jnp.arange(len(lenses))]
+    lens_types, spots = offsets.type_of[lenses], jnp.arange(len(lenses))
+
+    def at(columns: Float[Array, "type depth"]) -> Float[Array, " spot"]:
+        return jax.vmap(lambda column: jnp.interp(points[:, 2], offsets.depths, column))(columns)[lens_types, spots]
+
     radial = jnp.zeros_like(field2)
     for power in reversed(range(offsets.offset.shape[2])):
         radial = radial * field2 + at(offsets.offset[..., power])
@@ -261,7 +264,10 @@ def predict_spots(
 ) -> Float[Array, "source lens 2"]:
     """Predict the spots of sources, which are sharp or blurred, under every lens, mm."""
     lenses, dtype = jnp.arange(len(imager.array.centers)), imager.sensor_distance.dtype
-    of_source = lambda source: _predict(imager, jnp.tile(source[0], (len(lenses), 1)), lenses, offsets, source[1])
+
+    def of_source(source) -> Float[Array, "lens 2"]:
+        return _predict(imager, jnp.tile(source[0], (len(lenses), 1)), lenses, offsets, source[1])
+
     return jax.lax.map(of_source, (jnp.asarray(points, dtype), jnp.asarray(sharp)))
 
 
@@ -270,19 +276,18 @@ def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"], fit
 
     Without depths, where all spots are blurred, there are none.
     """
-    nodes, types = np.unique(depths), jnp.asarray(imager.array.type_of_lens)
-    if not len(nodes):
-        one = lambda *shape: jnp.zeros(shape, imager.sensor_distance.dtype)
-        return CoreOffsets(one(1), one(imager.array.type_count, 1, 1), {}, {}, types)
+    nodes, array = np.unique(depths), imager.array
     if len(nodes) > _DEPTHS:
         nodes = np.linspace(nodes[0], nodes[-1], _DEPTHS)
-    offset, slopes = core_polynomials(imager, nodes), {}
-    values = {name: number(imager, name) for name in _TRACED if name in fit}
+    values = {name: number(imager, name) for name in _TRACED if name in fit and len(nodes)}
+    offset = core_polynomials(imager, nodes) if len(nodes) else np.zeros((array.type_count, 1, 1))
+    slopes = {}
     for name, value in values.items():
         beyond = eqx.tree_at(lambda i, name=name: number(i, name), imager, value * (1 + _STEP))
         slopes[name] = (core_polynomials(beyond, nodes) - offset) / (float(value) * _STEP)
-    typed = lambda tables: jax.tree.map(lambda table: jnp.asarray(table, imager.sensor_distance.dtype), tables)
-    return CoreOffsets(typed(nodes), typed(offset), typed(slopes), typed(values), types)
+    tables = nodes if len(nodes) else np.zeros(1), offset, slopes, values
+    typed = jax.tree.map(lambda table: jnp.asarray(table, imager.sensor_distance.dtype), tables)
+    return CoreOffsets(*typed, type_of=jnp.asarray(array.type_of_lens))
 
 
 def core_polynomials(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "type depth power"]:

@@ -101,7 +101,7 @@ def find_blurred_spots(
     peaks = peaks[border >= _REACH * pitch][:most]
     if len(peaks) < 2:
         return np.zeros((0, 2)), np.zeros(0)
-    distances, nearest = (np.asarray(part) for part in KDTree(peaks).query(peaks, min(_BESIDE, len(peaks))))
+    distances, nearest = map(np.asarray, KDTree(peaks).query(peaks, min(_BESIDE, len(peaks))))
     pitches = np.clip(distances[:, 1], _NEAREST * pitch, pitch)
     dark = darkness[tuple(peaks.T)]
     light, dark, bright = image - dark.min(), dark - dark.min(), even[tuple(peaks.T)] - dark.min()
@@ -124,9 +124,9 @@ def _light_slopes(light, peaks) -> Float64[np.ndarray, "spot 2"]:
     """
     middle = peaks.mean(0)
     size = max(float(np.abs(peaks - middle).max()), 1.0)
-    (y, x), one = ((peaks - middle) / size).T, np.ones(len(peaks))
+    y, x = ((peaks - middle) / size).T
     logs = np.log(np.maximum(light, 1e-3 * light.max()))
-    terms = np.stack([one, y, x, y * y, x * y, x * x], -1)
+    terms = np.stack([np.ones_like(x), y, x, y * y, x * y, x * x], -1)
     c = np.linalg.lstsq(terms, logs)[0]
     if len(peaks) < 2 * len(c) or np.var(logs - terms @ c) > _UNEXPLAINED * np.var(logs):
         return np.zeros(peaks.shape)

@@ -218,7 +218,10 @@ def _facet_errors(corners, design: _Fit) -> tuple[float, float, float]:
     # Weighted by the projected area, as light travels along the axis.
     area = np.abs(normal[:, 2])
     cosine = np.abs((expected * normal[:, None]).sum(axis=2)) / np.linalg.norm(normal, axis=1)[:, None]
-    mean = lambda values: float(area @ (values @ WEIGHTS) / area.sum())
+
+    def mean(values) -> float:
+        return float(area @ (values @ WEIGHTS) / area.sum())
+
     offset = mean(error)
     return offset, math.sqrt(mean((error - offset) ** 2)), math.sqrt(mean(2 * (1 - np.minimum(cosine, 1))))
 
