@@ -24,15 +24,13 @@ from trimesh.exchange.stl import export_stl
 
 from .._version import __version__
 from ..base.errors import InputError, needs_extra
-from ..io.files import atomic_write, check_input, check_output, decoding
+from ..io.files import atomic_write, check_input, check_output, check_suffix, decoding
 from ..io.provenance import KEY, Provenance, write_sidecar
 from ..lenses import MicrolensArray
 from ..typing import PathLike
 from .lenslets import Part
 from .solids import MoldShape, alignment_marks, mold_bounds
 
-# Readers accept a few million facets of 50 bytes.
-MAX_MESH_BYTES = 2**31
 # Chordal tolerance of polygons where openings overlap, mm: below the resolution of photomasks.
 _MASK_CHORD = 1e-4
 # Unit and grid of GDSII files, m, and their last record, ENDLIB.
@@ -137,21 +135,13 @@ def check_mesh_reader(path: Path) -> None:
 def read_mesh(path: PathLike) -> Mesh:
     """Reads an STL or 3MF file, in mm, and merges equal vertices.
 
-    Raises `InputError` if the file cannot be read, is too large, has another format, or holds no facet.
+    Raises `InputError` if the file cannot be read, has another format, or holds no facet.
     """
     path = check_input(path)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: the suffix must be one of {', '.join(MESH_SUFFIXES)}, got {path.suffix!r}.")
-    if path.stat().st_size > MAX_MESH_BYTES:
-        raise InputError(f"{path}: must have at most {MAX_MESH_BYTES} bytes, got {path.stat().st_size}.")
+    check_suffix(path, MESH_SUFFIXES)
     check_mesh_reader(path)
     with decoding(path, "STL or 3MF file"):
-        scene = trimesh.load_scene(path, process=False)
-        loaded = scene.to_mesh()
-        if scene.units not in (None, "mm", "millimeter", "millimeters"):
-            loaded.units = scene.units
-            loaded.convert_units("millimeters")
-        corners = np.asarray(loaded.triangles)
+        corners = np.asarray(trimesh.load_mesh(path, process=False).triangles)
     if not len(corners) or not np.isfinite(corners).all():
         raise InputError(f"{path}: must hold facets with finite coordinates, got {len(corners)} facets.")
     return _merge_vertices(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
