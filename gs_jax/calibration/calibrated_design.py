@@ -7,17 +7,15 @@ from jaxtyping import Float64
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from pydantic import ValidationError
 from rich.table import Table
 
-from ..base.errors import InputError
+from ..base.errors import errors_name_file
 from ..design.conversion import default_sample, layers_of, medium_in_words, sample_table, sample_tables
 from ..design.design import Design
-from ..design.tables import LENS_KEYS, CalibrationTable
+from ..design.tables import LENS_KEYS
 from ..design.validation import reach
 from ..geometry import Imager
 from ..io.provenance import Provenance
-from ..io.toml import one_line
 from ..lenses import EACH, MicrolensArray
 from ..materials import index_of
 from .fit import Calibration
@@ -50,15 +48,14 @@ def apply_calibration(
         return rounded(x), rounded(y)
 
     centers = np.asarray(imager.array.centers, np.float64)
-    # The plate may be larger than designed, or lenses found beyond it.
-    size = np.maximum(design.array.size_mm, 2 * np.abs(centers).max(0) * (1 + 1e-9))
-    pairs = tuple(map(pair, centers))
-    array = design.array.model_copy(update={"centers_mm": pairs, "size_mm": pair(size)})
-    lens = design.lens.model_copy(update=_lens_lists(imager.array))
     tilt = (0.0, 0.0) if imager.tilt is None else np.degrees(np.arctan(imager.tilt))
-    pose = CalibrationTable(
-        rotation_deg=rounded(np.degrees(imager.rotation)), shift_mm=pair(imager.shift), tilt_deg=pair(tilt)
-    )
+    pose = {
+        "rotation_deg": rounded(np.degrees(imager.rotation)),
+        "shift_mm": pair(imager.shift),
+        "tilt_deg": pair(tilt),
+    }
+    numbers = {"centers_mm": np.array([pair(center) for center in centers]), **_lens_lists(imager.array)}
+    distance = {"sensor_distance_mm": rounded(imager.sensor_distance)}
     record: dict[str, Any] = {
         **(provenance or {}),
         "calibrated_rms_pixels": round(result.rms, 4),
@@ -69,20 +66,16 @@ def apply_calibration(
         "calibrated_values": {name: rounded(value) for name, value in result.values.items()},
         "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in result.deviations.items()},
     }
-    imaging = design.imaging.model_copy(update={"sensor_distance_mm": rounded(imager.sensor_distance)})
-    tables = {"array": array, "lens": lens, "imaging": imaging, "calibration": pose}
-    new = design.model_copy(update=tables | {"provenance": {**design.provenance, **record}})
-    distance, radius = reach(new)
-    if new.sensor.origin_mm is None and (distance > radius).any():
-        on = np.flatnonzero(distance <= radius)
-        lists = {key: tuple(values[k] for k in on) for key, values in _lens_lists(imager.array).items()}
-        array = array.model_copy(update={"centers_mm": tuple(pairs[k] for k in on)})
-        new = new.model_copy(update={"array": array, "lens": lens.model_copy(update=lists)})
-        new.provenance["lenses_beside_the_sensor"] = len(pairs) - len(on)
-    try:
-        return Design.model_validate(new.model_dump())
-    except ValidationError as error:
-        raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
+    tables = {"array": {"centers_mm": numbers["centers_mm"]}, "imaging": distance, "calibration": pose}
+    placed = {name: getattr(design, name).model_copy(update=values) for name, values in tables.items()}
+    away, radius = reach(design.model_copy(update=placed))
+    if design.sensor.origin_mm is None and (away > radius).any():
+        numbers = {key: values[away <= radius] for key, values in numbers.items()}
+        record["lenses_beside_the_sensor"] = int((away > radius).sum())
+    # The plate may be larger than designed, or lenses found beyond it.
+    size = pair(np.maximum(design.array.size_mm, 2 * np.abs(centers).max(0) * (1 + 1e-9)))
+    with errors_name_file("calibrated design"):
+        return design.replace(**numbers, **distance, **pose, size_mm=size, provenance={**design.provenance, **record})
 
 
 def with_sample(design: Design, imager: Imager, name: str | None) -> Design:
@@ -108,11 +101,10 @@ def with_sample(design: Design, imager: Imager, name: str | None) -> Design:
     return design.replace(layers=layers, sample=table)
 
 
-def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:
+def _lens_lists(array: MicrolensArray) -> dict[str, np.ndarray]:
     """Keys of `[lens]` with a number for each lens, by the fewest decimals that give the array's numbers."""
-    numbers = {key: name for key, name in zip(LENS_KEYS, EACH, strict=True) if getattr(array, name).ndim}
-    lists = {key: np.asarray(array.of_lenses(name)) for key, name in numbers.items()}
-    return {key: tuple(float(str(value)) for value in values) for key, values in lists.items()}
+    own = [(key, name) for key, name in zip(LENS_KEYS, EACH, strict=True) if getattr(array, name).ndim]
+    return {key: np.array([float(str(value)) for value in np.asarray(array.of_lenses(name))]) for key, name in own}
 
 
 def summary_table(design: Design, result: Calibration, start: Imager) -> Table:
