@@ -94,9 +94,8 @@ def make_mold(
     --------
     >>> from pathlib import Path
     >>> import gs_jax as gs
-    >>> design = gs.geomscope()
-    >>> few = design.array.model_copy(update={"centers_mm": ((-0.5, 0.1), (0.6, 0.0)), "size_mm": (3.0, 3.0)})
-    >>> report = gs.make_mold(design.model_copy(update={"array": few}), "mold.stl", chord=0.002)
+    >>> design = gs.geomscope().replace(centers_mm=[(-0.5, 0.1), (0.6, 0.0)], size_mm=(3.0, 3.0))
+    >>> report = gs.make_mold(design, "mold.stl", chord=0.002)
     >>> sorted(path.name for path in Path().glob("mold.*"))
     ['mold.stl', 'mold.stl.json', 'mold.stl.png', 'mold.stl.txt']
     """
