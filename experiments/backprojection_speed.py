@@ -47,9 +47,6 @@ class Job(NamedTuple):
     depths: int = 13
     sensor_distance_mm: float = 4.0
 
-    def shapes(self):
-        return self[:-1]
-
     def __str__(self):
         return (
             f"{self.depths} x {self.voxels}^2 voxels, {self.pixels}^2 pixels, {self.lenses} lenses, "
@@ -159,7 +156,7 @@ def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
     calls, results, compiled_s = {}, {}, {}
     for name in names:
         calls[name], seconds = prepared(name, CONTESTANTS[name].arguments(s))
-        once_for = name if name.startswith("numba") else (name, *job.shapes())  # JAX compiles for each size
+        once_for = name if name.startswith("numba") else (name, *job[:-1])  # JAX compiles for each size
         compiled_s[name] = compile_s.setdefault(once_for, seconds)
         results[name] = calls[name]()  # warm-up
     check(s, results)

@@ -203,8 +203,8 @@ class Methods:
             lucy = METHODS["richardson-lucy"](1)
             assert isinstance(lucy, gs.RichardsonLucy)
             self.lucy: gs.RichardsonLucy = lucy
-            self.start = jax.jit(lambda problem, light: lucy.init(problem.operator, light))
-            self.step = jax.jit(lambda problem, light, state: lucy.step(problem.operator, light, state)[0])
+            self.start = jax.jit(lambda problem, light: lucy.init(problem, light))
+            self.step = jax.jit(lambda problem, light, state: lucy.step(problem, light, state)[0])
         if "unrolled" in settings.methods:
             self.fine = finer(self.grid, settings.width)
             self.unrolled = gs.Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=gs.Progress())

@@ -178,14 +178,9 @@ def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1))
 
 def term_of(name: str, imager: Imager) -> float:
     """A term's worst value over its entries."""
-    at, term = Conditions(np.linspace(*SETTINGS.span, 3)), TERMS[name]
-    values = np.ravel(_value(term.function, imager, at, *([jax.random.key(0)] if term.random else [])))
+    at = Conditions(np.linspace(*SETTINGS.span, 3))
+    values = np.ravel(eqx.filter_jit(TERMS[name].function)(imager, at))
     return float(values.min() if BETTER[name] > 0 else values.max())
-
-
-@eqx.filter_jit
-def _value(function, *arguments):
-    return function(*arguments)
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float]:

@@ -42,7 +42,6 @@ _TARGET_MM = 2.8
 METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "all zero": np.zeros_like,
     "back-projection": lambda volume: volume,
-    "minus its median": lambda volume: np.maximum(volume - np.median(volume), 0),
     "paper's network": lambda volume: gs.suppress(volume, pretrained("paper")),
     "our network": lambda volume: gs.suppress(volume, pretrained("multislice")),
 }

@@ -145,8 +145,7 @@ def _lens_patches(image, geometry, volume):
 
     In a row all rays through a lens read the same two rows of the image. These are blended first, which leaves two
     pixels to gather per voxel instead of four. Loops are separate where that lets LLVM vectorise them (all but the
-    gathers). Slower variants: gathering four corners, fused loops, rows padded to the vector length, and slices, whose
-    reference counts the threads contend for.
+    gathers).
     """
     g = geometry
     y_start, y_low, y_weights, y_distance2 = _axis(g.y, g, g.rows, image.shape[0])

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, local_maxima, main, table
@@ -121,25 +120,6 @@ def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
     }
 
 
-def picture(rows: list) -> Figure:
-    """Plot F1 and errors against the number of points."""
-    figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained")
-    score, error = figure.subplots(1, 2)
-    count = [row["points"] for row in rows]
-    for name, style in (("gs_jax", "o-"), ("brightest peaks", "s--")):
-        label = {"gs_jax": "find_points", "brightest peaks": "as many brightest peaks"}[name]
-        score.plot(count, [row[name]["f1"] for row in rows], style, label=label)
-    error.plot(count, [row["gs_jax"]["lateral_rmse_um"] for row in rows], "o-", label="lateral")
-    error.plot(count, [row["gs_jax"]["axial_rmse_um"] for row in rows], "s--", label="axial")
-    area = f"points in {SIZE[0]:g} x {SIZE[1]:g} x {DEPTHS[1] - DEPTHS[0]:g} mm"
-    score.set(xscale="log", xlabel=area, ylabel="F1", ylim=(0, 1.05), title="points found")
-    error.set(xscale="log", yscale="log", xlabel=area, ylabel="RMS error, um", title="find_points")
-    for axes in (score, error):
-        axes.grid(alpha=0.3)
-        axes.legend()
-    return figure
-
-
 def of_draws(design: gs.Design, number: int, progress: gs.Progress) -> Report:
     """The report of draws of beads."""
     results = draws(design, number, progress=progress)
@@ -159,7 +139,7 @@ def report(design: Path | None, draws: int | None, progress: gs.Progress) -> Rep
     columns = ("points", "captures", "F1", "precision", "recall", "lateral, um", "axial, um", "F1 of peaks")
     numbers = lambda row: (f"{n:.3f}" for n in (*row["gs_jax"].values(), row["brightest peaks"]["f1"]))
     shown = table(columns, [[str(row["points"]), str(row["captures"]), *numbers(row)] for row in results])
-    return Report({"point_density.json": results, "point_density.png": picture(results)}, [shown])
+    return Report({"point_density.json": results}, [shown])
 
 
 if __name__ == "__main__":

@@ -126,8 +126,7 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     # Where a wide spot is depends on the window that looks.
     centers = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
     ones = np.ones(len(centers))
-    reach = 0.5 * pitch * ones, 0.25 * pitch * ones  # as calibration has them
-    two = [mean_shift(image, centers, width * ones, *reach) for width in WINDOWS]
+    two = [mean_shift(image, centers, width * ones, pitch / 2 * ones, pitch / 4 * ones) for width in WINDOWS]
     wide = seen > np.median(seen)
     results = {
         "mirrored": found.mirrored,

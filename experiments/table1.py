@@ -157,10 +157,8 @@ def _counted(design: Design) -> str:
 
 def markdown(results: dict[str, list[dict[str, str]]]) -> str:
     """Both tables in Markdown."""
-    return (
-        "\n\n".join(markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in results.values())
-        + "\n"
-    )
+    made = (markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in results.values())
+    return "\n\n".join(made) + "\n"
 
 
 def report(progress: Progress) -> Report:

@@ -144,10 +144,8 @@ def strokes(plane: dict, pitch: float = 0.012) -> np.ndarray:
         along = np.clip(np.real((points - start) / (end - start)), 0, 1)
         distance = np.minimum(distance, np.abs(points - start - along * (end - start)))
     covered = np.clip((plane["width_mm"] / 2 - distance) / pitch + 0.5, 0, 1)
-    lit = points[covered > 0]
-    return np.column_stack(
-        [np.real(lit), np.imag(lit), np.full(lit.size, plane["z_mm"]), covered[covered > 0] * pitch**2]
-    )
+    lit, light = points[covered > 0], covered[covered > 0] * pitch**2
+    return np.column_stack([np.real(lit), np.imag(lit), np.full(lit.size, plane["z_mm"]), light])
 
 
 def bars(elements: list[dict], depth: float = 18.0, pitch: float = 0.0025) -> np.ndarray:

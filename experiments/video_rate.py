@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 import psutil
 import tifffile
-from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
 from gs_jax import Design, Progress, Reconstructor, geomscope, simulate, write_design
@@ -238,20 +237,6 @@ def run(frames: int, pixels: int, many: int, coarse: int, few: int = 100, rates:
     return results | {"load_after": psutil.getloadavg()}
 
 
-def picture(long: dict[str, dict]) -> Figure:
-    """Plot resident memory against frames written."""
-    figure = Figure(figsize=(7, 3.4), dpi=100, layout="constrained")
-    axes = figure.subplots()
-    for label, row in long.items():
-        _, done, memory = np.array(row["seconds_frames_mib"]).T
-        running = done < row["frames"]  # the rest is the end of the processes
-        axes.plot(done[running], memory[running], label=label)
-    axes.set(xlabel="frames written", ylabel="resident memory, MiB")
-    axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
-    axes.legend(fontsize=8)
-    return figure
-
-
 def growth(long: dict) -> tuple[float, float]:
     """Median memory in the second and in the last tenth of the frames, MiB."""
     _, done, memory = np.array(long["seconds_frames_mib"]).T
@@ -283,7 +268,7 @@ def report(frames: int, pixels: int, many: int, coarse: int, progress: Progress)
     delays = [[format(row[key], form) for key, (_, form) in LIVE.items()] for row in results["live"]]
     title = "{} frames of {}^2 to {} x {} x {} voxels".format(frames, pixels, *results["voxels_z_y_x"])
     text = f"**{title}**\n\n{markdown_table(('', ''), rows)}\n\n{markdown_table(columns, delays)}\n"
-    files = {"video_rate.json": results, "video_rate.md": text, "video_rate.png": picture(results["long"])}
+    files = {"video_rate.json": results, "video_rate.md": text}
     return Report(files, [table(("", ""), rows, title), table(columns, delays)])
 
 

@@ -317,4 +317,3 @@ def test_a_hundred_simulated_points_are_found():
     (row,) = point_density.run(geomscope(), {100: 1}, progress=Progress())
     assert row["gs_jax"]["f1"] >= 0.95
     assert row["gs_jax"]["lateral_rmse_um"] <= 15 and row["gs_jax"]["axial_rmse_um"] <= 120
-    point_density.picture([row])
