@@ -41,21 +41,15 @@ def chi_square_p(sample, mean):
 
 @pytest.mark.integration
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("mean", [0.01, 0.3, 1.0, 3.7, 15.99, 16.0, 60.0, 400.0, 1e4])
+@pytest.mark.parametrize("mean", [0.01, 0.3, 1.0, 3.7, 15.99, 16.0, 60.0, 400.0, 1e4, 1e6])
 def test_poisson_has_its_distribution(mean, dtype):
     """A million samples: the expansion's error adds 3 to a chi-square of 35 or so at 16, less above."""
-    sample = np.asarray(draw(KEY, np.full(1_000_000, mean, dtype)))
+    sample = np.asarray(draw(KEY, np.full(n := 1_000_000, mean, dtype)))
     assert sample.dtype == dtype and (sample == np.floor(sample)).all()
-    assert chi_square_p(sample, mean) > 1e-4
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("mean", [0.5, 15.9, 16.1, 1e6])
-def test_poisson_mean_and_variance(mean, dtype):
-    n = 1_000_000
-    sample = np.asarray(draw(KEY, np.full(n, mean, dtype)), float)
+    # Of larger means the sample is too sparse.
+    assert mean > 1e4 or chi_square_p(sample, mean) > 1e-4
     # Five standard deviations; the variance of a variance is (3 m^2 + m - m^2) / n.
+    sample = sample.astype(float)
     assert abs(sample.mean() - mean) < 5 * math.sqrt(mean / n)
     assert abs(sample.var() - mean) < 5 * math.sqrt((2 * mean**2 + mean) / n)
 
@@ -111,13 +105,17 @@ def test_photon_transfer(gain, dtype):
     np.testing.assert_allclose(slope, 1 / gain, rtol=0.05)
 
 
-def test_a_dark_image_is_offset_and_read_noise():
+def test_dark_images_are_offset_and_read_noise():
     dark = np.zeros((400, 500))
     counts = np.asarray(expose(dark, Camera(), KEY, peak_electrons=1e4))
     assert counts.dtype == np.uint16
     # N(16, 0.2) rounds to 16 but for 1.2 %.
     np.testing.assert_allclose((counts != 16).mean(), 2 * stats.norm.sf(0.5 / 0.2), rtol=0.15)
     assert (np.asarray(expose(dark, Camera(read_noise=0.0), KEY, peak_electrons=1e4)) == 16).all()
+    # Counts end at zero. Five standard deviations of a share of 200,000.
+    counts = np.asarray(expose(dark, Camera(gain=1.0, offset=0.0, read_noise=5.0), KEY, peak_electrons=1.0))
+    np.testing.assert_allclose((counts == 0).mean(), stats.norm.cdf(0.1), atol=5 * 0.5 / math.sqrt(200_000))
+    assert counts.max() < 50
 
 
 @pytest.mark.integration
@@ -142,14 +140,6 @@ def test_the_well_and_the_converter_saturate():
         counts = np.asarray(expose(image[:8, :9], Camera(gain=1.0, bits=bits), KEY, peak_electrons=4000))
         assert counts.dtype == dtype and (counts == 2**bits - 1).all()
     assert (np.asarray(expose(image, Camera(gain=0.01), KEY, peak_electrons=4000)) == 65535).all()
-
-
-def test_counts_end_at_zero():
-    camera = Camera(gain=1.0, offset=0.0, read_noise=5.0)
-    counts = np.asarray(expose(np.zeros((400, 500)), camera, KEY, peak_electrons=1))
-    # Five standard deviations of a share of 200,000.
-    np.testing.assert_allclose((counts == 0).mean(), stats.norm.cdf(0.1), atol=5 * 0.5 / math.sqrt(200_000))
-    assert counts.max() < 50
 
 
 def test_counts_are_rounded_electrons():
@@ -182,24 +172,15 @@ def test_keys_and_independence():
 
 @pytest.mark.integration
 def test_vmap_over_images_and_keys():
-    """Of 19 rows, which are not a whole number of blocks."""
+    """Of 19 rows, which are not a whole number of blocks; another camera is the same program."""
     images = jnp.asarray(np.random.default_rng(0).random((2, 19, 20)))
     run = lambda image, key: expose(image, Camera(), key, peak_electrons=100.0)
     keys = jax.random.split(KEY, 2)
     expected = [run(image, key) for image, key in zip(images, keys, strict=True)]
     np.testing.assert_array_equal(jax.vmap(run)(images, keys), expected)
-
-
-def test_another_camera_does_not_recompile():
     traces = []
-
-    @jax.jit
-    def run(camera):
-        traces.append(camera)
-        return expose(np.ones((4, 5)), camera, KEY, peak_electrons=100.0)
-
-    for gain in (1.0, 2.0):
-        run(Camera(gain=gain))
+    compiled = jax.jit(lambda camera: traces.append(camera) or expose(images[0], camera, KEY, peak_electrons=100.0))
+    compiled(Camera(gain=1.0)), compiled(Camera(gain=2.0))
     assert len(traces) == 1
 
 
@@ -230,10 +211,7 @@ def test_it_is_fast_enough():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (
-            lambda: expose(flat(1.0) - 0.5, Camera(), KEY, peak_electrons=1),
-            "`image` must be finite and not negative, got",
-        ),
+        (lambda: expose(flat(-1.0), Camera(), KEY, peak_electrons=1), "`image` must be finite and not negative, got"),
         (lambda: expose(flat(math.nan), Camera(), KEY, peak_electrons=1), "`image` .* got 199999 pixels that are not"),
         (lambda: expose(flat(math.inf), Camera(), KEY, peak_electrons=1), "`image` .* got 199999 pixels"),
         (lambda: expose(flat(1.0), Camera(), KEY, peak_electrons=0), "`peak_electrons` must be positive and finite"),

@@ -45,16 +45,14 @@ def test_grey_tiff(tmp_path, name, dtype):
     np.testing.assert_array_equal(found, pixels)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("differences", [False, True])
-def test_lzw(tmp_path, dtype, differences):
-    """Which tifffile alone does not read; with differences of neighbours (of floats, of their bytes) and without."""
-    pixels = (GREY >> 8).astype(dtype)
-    predictor = {317: 3 if dtype == "float32" else 2} if differences else {}
-    Image.fromarray(pixels).save(tmp_path / "a.tif", compression="tiff_lzw", tiffinfo=predictor)
-    found = read_capture(tmp_path / "a.tif")
-    assert found.dtype == dtype
-    np.testing.assert_array_equal(found, pixels)
+def tiff_of_one_strip(data, shape, bits, order, more):
+    """A TIFF of coded pixels, with further tags."""
+    rows, columns = shape
+    tags = {256: columns, 257: rows, 258: bits, 262: 1, 273: 0, 277: 1, 278: rows, 279: len(data)} | more
+    tags = dict(sorted(tags.items())) | {273: 8 + 2 + 12 * len(tags) + 4}
+    entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags.items())
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(tags))
+    return head + entries + bytes(4) + data
 
 
 def lzw(data):
@@ -93,13 +91,8 @@ def test_bytes_in_either_order(tmp_path, order, compression, dtype, predictor):
     runs = b"".join(bytes([len(part) - 1]) + part for part in (data[at : at + 128] for at in range(0, len(data), 128)))
     codes = {"none": 1, "lzw": 5, "deflate": 8, "old deflate": 32946, "packbits": 32773}
     coded = {"none": data, "lzw": lzw(data), "packbits": runs}.get(compression, zlib.compress(data))
-    rows, columns = pixels.shape
-    tags = {256: columns, 257: rows, 258: 8 * pixels.itemsize, 259: codes[compression], 262: 1, 273: 0, 277: 1}
-    tags |= {278: rows, 279: len(coded), 317: predictor, 339: 3 if dtype == "float32" else 1}
-    tags[273] = 8 + 2 + 12 * len(tags) + 4
-    entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags.items())
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(tags))
-    (tmp_path / "a.tif").write_bytes(head + entries + bytes(4) + coded)
+    tags = {259: codes[compression], 317: predictor, 339: 3 if dtype == "float32" else 1}
+    (tmp_path / "a.tif").write_bytes(tiff_of_one_strip(coded, pixels.shape, 8 * pixels.itemsize, order, tags))
     found = read_capture(tmp_path / "a.tif")
     assert found.dtype == dtype and found.dtype.isnative
     np.testing.assert_array_equal(found, pixels)
@@ -134,18 +127,14 @@ def packed(pixels, bits):
     """A TIFF of one strip whose pixels lie bit to bit, rows from a whole byte on."""
     kept = np.unpackbits(pixels.astype(">u2").view(np.uint8)).reshape(*pixels.shape, 16)[..., -bits:]
     data = np.packbits(kept.reshape(len(pixels), -1), axis=1).tobytes()
-    rows, columns = pixels.shape
-    tags = {256: columns, 257: rows, 258: bits, 259: 1, 262: 1, 273: 0, 277: 1, 278: rows, 279: len(data)}
-    tags[273] = 8 + 2 + 12 * len(tags) + 4
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
-    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + data
+    return tiff_of_one_strip(data, pixels.shape, bits, "<", {259: 1})
 
 
-@pytest.mark.parametrize("columns", [40, 41])
-def test_packed_12_bits(tmp_path, columns):
-    pixels = GREY[:, :columns] >> 4
-    (tmp_path / "a.tif").write_bytes(packed(pixels, 12))
-    np.testing.assert_array_equal(read_capture(tmp_path / "a.tif"), pixels)
+def test_packed_12_bits(tmp_path):
+    for columns in (40, 41):
+        pixels = GREY[:, :columns] >> 4
+        (tmp_path / "a.tif").write_bytes(packed(pixels, 12))
+        np.testing.assert_array_equal(read_capture(tmp_path / "a.tif"), pixels)
 
 
 @pytest.mark.parametrize("name", [*STACKS, "lzw.tif", "stack.npy"])

@@ -1,5 +1,6 @@
 """What a camera does to light, undone: dark frame, flat field, bad pixels; and what is said of it."""
 
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -140,10 +141,7 @@ def test_bad_pixels_are_filled_from_good_ones():
 def test_what_is_cut_off(top, count, dtype, is_cut):
     image = np.random.default_rng(3).integers(0, max(top * 0.9, 1), SHAPE).astype(dtype)
     image.flat[:count] = top
-    found = count_saturated(image)
-    assert (found is not None) == is_cut
-    if found:
-        assert found == (count, top)
+    assert count_saturated(image) == ((count, top) if is_cut else None)
 
 
 @pytest.mark.parametrize("light", [3e38, -3e38])
@@ -180,29 +178,24 @@ def test_what_was_done_is_said(tmp_path):
     assert len(warnings) == 1 and "a.tif: 80 pixels (0.01 of all) are saturated at 255" in warnings[0]
 
 
-def wrong(folder, name):
-    saved(folder / "other.tif", np.ones((40, 50)))
-    np.save(folder / "good.npy", np.ones(SHAPE, bool))
-    saved(folder / "dark.tif", DARK)
-    return {
-        "dark": (Correction(dark=folder / "other.tif"), ["other.tif", "40 x 50", "60 x 70"]),
-        "flat": (Correction(flat=folder / "other.tif"), ["other.tif", "40 x 50", "60 x 70"]),
-        "mask": (Correction(bad_pixels=folder / "other.tif"), ["other.tif", "40 x 50", "60 x 70"]),
-        "missing": (Correction(dark=folder / "none.tif"), ["none.tif", "No such file"]),
-        "good": (Correction(bad_pixels=folder / "good.npy"), ["good.npy", "100%", "0 for good"]),
-        "unlit": (Correction(folder / "dark.tif", folder / "dark.tif"), ["dark.tif", "median of 0", "even light"]),
-        "both": (Correction(dark=folder / "dark.tif", offset=3.0), ["--offset", "dark.tif"]),
-    }[name]
+WRONG = {
+    "dark": (Correction(dark=Path("other.tif")), ["other.tif", "40 x 50", "60 x 70"]),
+    "flat": (Correction(flat=Path("other.tif")), ["other.tif", "40 x 50", "60 x 70"]),
+    "mask": (Correction(bad_pixels=Path("other.tif")), ["other.tif", "40 x 50", "60 x 70"]),
+    "missing": (Correction(dark=Path("none.tif")), ["none.tif", "No such file"]),
+    "good": (Correction(bad_pixels=Path("good.npy")), ["good.npy", "100%", "0 for good"]),
+    "unlit": (Correction(Path("dark.tif"), Path("dark.tif")), ["dark.tif", "median of 0", "even light"]),
+    "both": (Correction(dark=Path("dark.tif"), offset=3.0), ["--offset", "dark.tif"]),
+}
 
 
-@pytest.mark.parametrize("sensor", [Sensor(SHAPE, 0.01), None])
-@pytest.mark.parametrize("name", ["dark", "flat", "mask", "missing", "good", "unlit", "both"])
-def test_a_wrong_file_is_named(tmp_path, name, sensor):
-    correction, words = wrong(tmp_path, name)
-    capture = saved(tmp_path / "a.tif", np.ones(SHAPE))
-    with pytest.raises(InputError) as caught:
-        read_corrected(capture, sensor, correction=correction)
-    message = str(caught.value)
-    assert message.isprintable() and len(message) < 400
-    for word in words:
-        assert word in message
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_is_named(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    saved("other.tif", np.ones((40, 50))), saved("dark.tif", DARK), saved("a.tif", np.ones(SHAPE))
+    np.save("good.npy", np.ones(SHAPE, bool))
+    for sensor in (Sensor(SHAPE, 0.01), None):
+        with pytest.raises(InputError) as caught:
+            read_corrected("a.tif", sensor, correction=WRONG[name][0])
+        message = str(caught.value)
+        assert message.isprintable() and len(message) < 400 and all(word in message for word in WRONG[name][1])

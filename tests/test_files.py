@@ -29,7 +29,7 @@ from gs_jax.io.point_tables import POINTS_HEADER, read_points, read_positions, r
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.simulation.synthetic import read_scene
 
-from .helpers import examples, needs
+from .helpers import examples
 
 GREY = np.arange(30, dtype=np.uint16).reshape(5, 6) * 2000
 GRID = Grid([18.0, 18.1, 18.2], (5, 6), 0.0123)
@@ -65,30 +65,6 @@ def test_capture_round_trip(tmp_path, suffix, dtype, kind):
     assert back.dtype == image.dtype and back.flags.c_contiguous
     np.testing.assert_array_equal(back, image)
     assert os.listdir(tmp_path) == [path.name]
-
-
-def test_real_captures():
-    image = read_capture(needs("oracle/dev/P1_a.tif"), (5120, 5120))  # Deflate
-    assert image.dtype == np.uint16 and image.max() == 1022
-    image = read_capture(needs("diffusercam/psf_sample.tif"))  # without a compression
-    assert image.shape == (1200, 1600) and image.max() == 65520
-
-
-def test_captures_of_other_programs(tmp_path):
-    path = tmp_path / "a.tif"
-    variants: list[dict[str, Any]] = [
-        {"byteorder": ">"},
-        {"compression": "zlib", "tile": (16, 16)},
-        {"imagej": True},
-        {"ome": True},
-    ]
-    for options in variants:
-        tifffile.imwrite(path, GREY, photometric="minisblack", **options)
-        np.testing.assert_array_equal(read_capture(path), GREY)
-    Image.fromarray(GREY).save(path, compression="tiff_adobe_deflate")
-    np.testing.assert_array_equal(read_capture(path), GREY)
-    np.save(tmp_path / "a.npy", np.asfortranarray(GREY.astype(">u2")))
-    np.testing.assert_array_equal(read_capture(tmp_path / "a.npy"), GREY)
 
 
 def png(rows, columns, bits=8, colour=0, body=b""):
@@ -133,27 +109,20 @@ WRONG_CAPTURES = {
     "empty.npy": (lambda path: path.write_bytes(b""), [".npy"]),
     "text.tif": (lambda path: path.write_text("no image"), ["TIFF"]),
     "text.png": (lambda path: path.write_text("no image" * 9), ["PNG"]),
-    "text.npy": (lambda path: path.write_text("no image"), [".npy"]),
     "other.png": (tiff, ["PNG"]),
     "other.npy": (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), [".npy"]),
     "cut.tif": (lambda path: (tiff(path), cut(path, -20)), ["TIFF"]),
     "cut_header.tif": (lambda path: (tiff(path), cut(path, 60)), ["TIFF"]),
     "cut_deflate.tif": (lambda path: (tiff(path, compression="zlib"), cut(path, -9)), ["TIFF"]),
-    "empty_strip.tif": (lambda path: (tiff(path), retag(path, 279, 0)), ["TIFF", "not in the file"]),
     "rows.tif": (lambda path: (tiff(path), retag(path, 257, 2**20)), ["strips", "got 1"]),
     "short_strip.tif": (lambda path: (tiff(path), retag(path, 279, 40)), ["TIFF", "not in the file"]),
     "strips.tif": (lambda path: (tiff(path, rowsperstrip=2), retag(path, 257, 20)), ["the 10 strips", "got 3"]),
     "cut.png": (lambda path: (image(GREY)(path), cut(path, -30)), ["PNG"]),
     "cut.npy": (lambda path: (np.save(path, GREY), cut(path, -1)), [".npy"]),
-    "colour.tif": (lambda path: tiff(path, RGB, photometric="rgb"), ["colour (RGB)", "--channel red"]),
-    "planar.tif": (lambda path: tiff(path, RGB.T, photometric="rgb", planarconfig="separate"), ["RGB", "greyscale"]),
     "samples.tif": (lambda path: tiff(path, RGB, planarconfig="contig"), ["3 samples", "greyscale"]),
     "palette.tif": (lambda path: Image.fromarray(RGB).convert("P").save(path), ["palette", "greyscale"]),
     "white.tif": (lambda path: tiff(path, photometric="miniswhite"), ["0 as white", "0 as black"]),
-    "mosaic.tif": (lambda path: (tiff(path), retag(path, 262, 32803)), ["colour filter mosaic"]),
-    "colour.png": (image(RGB), ["colour (RGB)", "greyscale"]),
     "alpha.png": (image(np.zeros((5, 6, 2), np.uint8)), ["transparency", "greyscale"]),
-    "rgba.png": (image(np.zeros((5, 6, 4), np.uint8)), ["colour (RGB)", "--channel red"]),
     "palette.png": (lambda path: Image.fromarray(RGB).convert("P").save(path), ["palette", "greyscale"]),
     "bits.png": (lambda path: Image.fromarray(RGB[..., 0]).convert("1").save(path), ["1-bit", "uint8"]),
     "animated.png": (
@@ -162,19 +131,10 @@ WRONG_CAPTURES = {
         ),
         ["2 pages"],
     ),
-    "pages.tif": (lambda path: tiff(path, np.stack([GREY, GREY])), ["2 pages", "--page 1 to 2"]),
-    "imagej.tif": (lambda path: tiff(path, np.stack([GREY] * 3), imagej=True), ["3 pages", "--page 1 to 3"]),
-    "truncated_stack.tif": (lambda path: tiff(path, np.stack([GREY] * 3), truncate=True), ["3 pages", "--page 1 to 3"]),
-    "stack.npy": (saved(np.zeros((2, 5, 6), np.uint8)), ["2 pages", "--page 1 to 2"]),
     "line.npy": (saved(np.zeros(5, np.uint8)), ["2-D"]),
-    "scalar.npy": (saved(np.array(5, np.uint8)), ["2-D"]),
     "none.npy": (saved(np.zeros((0, 5), np.uint8)), []),
     "float64.tif": (lambda path: tiff(path, GREY.astype(float)), ["float64", "uint16", "convert"]),
-    "int16.tif": (lambda path: tiff(path, GREY.astype(np.int16)), ["int16", "uint16", "convert"]),
-    "uint32.tif": (lambda path: tiff(path, GREY.astype(np.uint32)), ["uint32", "convert"]),
-    "float16.npy": (saved(GREY.astype(np.float16)), ["float16", "convert"]),
     "bool.npy": (saved(GREY > 9), ["bool", "convert"]),
-    "complex.npy": (saved(GREY.astype(np.complex64)), ["complex64", "convert"]),
     "record.npy": (saved(np.zeros((5, 6), [("a", "u1"), ("b", "u2")])), ["convert"]),
     "pickle.npy": (saved(np.full((5, 6), {}, object)), [".npy"]),
     "nan.tif": (lambda path: tiff(path, np.full((5, 6), np.nan, np.float32)), ["nan", "(0, 0)", "finite"]),
@@ -188,15 +148,6 @@ WRONG_CAPTURES = {
     "bomb.tif": (lambda path: (tiff(path), retag(path, 256, 2**31), retag(path, 257, 2**31)), []),
     "short.png": (lambda path: path.write_bytes(png(5, 6, body=b"\0\1\2")), ["PNG"]),
 }
-
-
-@pytest.mark.parametrize("name", WRONG_CAPTURES)
-def test_wrong_capture(tmp_path, name):
-    make, words = WRONG_CAPTURES[name]
-    path = tmp_path / name
-    if make is not None:
-        make(path)
-    refusal(read_capture, path, words=words)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".png", ".npy"])
@@ -241,13 +192,6 @@ WRONG_POINTS = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_POINTS)
-def test_wrong_points(tmp_path, name):
-    path = tmp_path / "points.csv"
-    path.write_bytes(WRONG_POINTS[name][0])
-    refusal(read_points, path, words=WRONG_POINTS[name][1])
-
-
 FLOATS = st.floats(-1e4, 1e4)
 ROWS = st.lists(st.tuples(FLOATS, FLOATS, st.floats(1e-3, 1e4), st.floats(0, 1e300)), max_size=4)
 FUZZ = settings(max_examples=examples(120), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -282,35 +226,14 @@ def read_or_refusal(path):
         return str(error)
 
 
-CELLS = st.sampled_from(
-    [
-        "1",
-        "-2.5",
-        " 3",
-        "4\t",
-        "+1e-3",
-        ".5",
-        "5.",
-        "1e400",
-        "nan",
-        "1_0",
-        "x",
-        "",
-        '"6"',
-        "1e",
-        "\x1c7",
-        "٣",
-        "1\r",
-        "#",
-    ]
-)
+CELLS = st.sampled_from('1|-2.5| 3|4\t|+1e-3|.5|5.|1e400|nan|1_0|x||"6"|1e|\x1c7|٣|1\r|#'.split("|"))
 LINES = st.lists(st.one_of(st.tuples(CELLS, CELLS).map(",".join), CELLS), max_size=5)
 HEADERS = st.sampled_from(["a,b\n", "a,b\r\n", "a,b", "a,b\r", "b,a\n", '"a",b\n', "\ufeffa,b\n", "\n"])
 
 
 @FUZZ
 @given(header=HEADERS, lines=LINES, end=st.sampled_from(["\n", "\r\n", "\n\n", "\r"]))
-def test_plain_numberss_are_read_as_all_others(tmp_path, header, lines, end):
+def test_plain_tables_are_read_as_all_others(tmp_path, header, lines, end):
     """What NumPy reads at once, and what is read line by line to say what is wrong: equal numbers, equal words."""
     path = tmp_path / "a.csv"
     path.write_text(header + end.join(lines), encoding="utf-8", newline="")
@@ -324,9 +247,7 @@ def test_plain_numberss_are_read_as_all_others(tmp_path, header, lines, end):
 def test_points_of_european_spreadsheets(tmp_path, separator):
     """With decimal commas, further columns and quoted names; and as fast a table as any, with points."""
     path, header = tmp_path / "a.csv", POINTS_HEADER.replace(",", separator)
-    path.write_text(
-        f"\ufeff{header}\r\n0,5{separator}-0.25{separator} 18,75{separator}1e3\r\n", encoding="utf-8", newline=""
-    )
+    path.write_bytes(f"\ufeff{header}\r\n0,5{separator}-0.25{separator} 18,75{separator}1e3\r\n".encode())
     np.testing.assert_array_equal(read_points(path), [[0.5, -0.25, 18.75, 1000]])
     path.write_text(f"{header}{separator}frame\n0,5{separator}1{separator}20{separator}1{separator}7\n")
     np.testing.assert_array_equal(read_points(path), [[0.5, 1, 20, 1]])
@@ -385,23 +306,12 @@ def test_ome_tiff_metadata(tmp_path):
         assert plane["PositionX"] == pytest.approx(float(GRID.x[0]) * 1000, rel=1e-12)
         assert plane["PositionY"] == pytest.approx(float(GRID.y[0]) * 1000, rel=1e-12)
         assert {plane[f"Position{axis}Unit"] for axis in "XYZ"} == {"µm"}
-    with tifffile.TiffFile(tmp_path / "a.ome.tif") as file:  # for ImageJ, which has the unit in its description
-        assert file.pages.first.tags["ResolutionUnit"].value == 1
-        pixels, um = file.pages.first.tags["XResolution"].value
-        assert pixels / um == pytest.approx(1 / 12.3, rel=1e-6)
-
-
-def test_the_schemas_fields_by_hand(tmp_path):
-    """Of OME 2016-06: order of elements, required attributes, one TiffData, positive lengths."""
+    # Order of elements in OME 2016-06; a plane has no step.
     write_volume(tmp_path / "a.tif", VOLUME[:1], Grid([20.0], (5, 6), 0.01))
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         xml = file.pages.first.description
-    assert 'xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"' in xml
-    (attributes, body) = re.findall(r"<Pixels (.*?)>(.*)</Pixels>", xml)[0]
-    required = ["ID", "DimensionOrder", "Type", "SizeX", "SizeY", "SizeZ", "SizeC", "SizeT"]
-    assert all(f"{name}=" in attributes for name in required)
-    assert 'DimensionOrder="XYZCT"' in attributes or 'DimensionOrder="XYCZT"' in attributes
-    assert "PhysicalSizeZ" not in attributes  # one plane has no step
+    ((attributes, body),) = re.findall(r"<Pixels (.*?)>(.*)</Pixels>", xml)
+    assert 'xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"' in xml and "PhysicalSizeZ" not in attributes
     assert re.findall(r"<(\w+)[ />]", body) == ["Channel", "LightPath", "TiffData", "Plane"]
     assert 'TheC="0" TheZ="0" TheT="0"' in body and 'PositionZ="20000.0"' in body
 
@@ -446,35 +356,23 @@ def test_ome_zarr_metadata(tmp_path):
 )
 def test_volume_round_trip(tmp_path, shape, start, step, pitch, suffix, dtype):
     depths = jnp.asarray((start + step * np.arange(shape[0])) / 1000, dtype)
-    grid = Grid(depths, shape[1:], pitch)
+    grid = Grid(depths, shape[1:], pitch, (-3 * pitch, 0.7))
     volume = np.random.default_rng(step).normal(size=shape).astype(np.float32)
     write_volume(tmp_path / f"a{suffix}", volume, grid)
     back, found = read_volume(tmp_path / f"a{suffix}")
     assert back.dtype == np.float32
     np.testing.assert_array_equal(back, volume)
     assert found.shape == grid.shape
+    np.testing.assert_allclose(found.origin, grid.origin, atol=1e-6)
     # 12 digits are written; a float32 depth is written as the decimal that it is the nearest of.
     assert found.pitch == pytest.approx(pitch, rel=1e-11)
     np.testing.assert_allclose(found.depths, depths.astype(float), rtol=1e-11 if dtype == jnp.float64 else 1e-6)
 
 
-@pytest.mark.parametrize("suffix", [".ome.tif", ".zarr"])
-def test_a_cropped_volume_is_read_back_where_it_was(tmp_path, suffix):
-    """What a viewer crops keeps the positions of its voxels: the grid has an origin beside the axis."""
-    whole = Grid([18.0, 18.5, 19.0], (9, 11), 0.0123)
-    x, y = (axis[part].mean() for axis, part in ((whole.x, slice(4, 10)), (whole.y, slice(1, 6))))
-    write_volume(tmp_path / f"a{suffix}", VOLUME, Grid(whole.depths, (5, 6), 0.0123, (x, y)))
-    voxels, grid = read_volume(tmp_path / f"a{suffix}")
-    np.testing.assert_array_equal(voxels, VOLUME)
-    np.testing.assert_allclose(grid.x, whole.x[4:10], atol=1e-9)
-    np.testing.assert_allclose(grid.y, whole.y[1:6], atol=1e-9)
-
-
 def test_a_volume_larger_than_a_chunk(tmp_path):
     volume = np.zeros((1, 3, 1500), np.float32)
     volume[0, 2, 1300] = 1e30  # neither clipped nor rescaled
-    grid = Grid([20.0], (3, 1500), 0.004)
-    write_volume(tmp_path / "a.zarr", jnp.asarray(volume), grid)
+    write_volume(tmp_path / "a.zarr", jnp.asarray(volume), Grid([20.0], (3, 1500), 0.004))
     np.testing.assert_array_equal(read_volume(tmp_path / "a.zarr")[0], volume)
     assert sorted(os.listdir(tmp_path / "a.zarr" / "0" / "0" / "0")) == ["1"]  # empty chunks take no room
 
@@ -542,7 +440,6 @@ WRONG_TIFF_VOLUMES = {
     "text": (lambda path: path.write_text("no"), ["OME-TIFF"]),
     "plain": (lambda path: tiff(path, VOLUME), ["OME-TIFF"]),
     "xml": (lambda path: ome(path, less("</OME>", "OME>")), ["OME-TIFF"]),
-    "entities": (lambda path: ome(path, less("<OME", '<!DOCTYPE a [<!ENTITY b "c">]><OME')), []),
     "images": (lambda path: ome(path, less("<Image.*</Image>")), ["0 images", "one"]),
     "sizes": (lambda path: ome(path, less('SizeZ="3"', 'SizeZ="4"')), ["OME sizes", "'4'"]),
     "channels": (lambda path: ome(path, less('SizeC="1"', 'SizeC="3"')), ["OME sizes"]),
@@ -565,19 +462,10 @@ WRONG_TIFF_VOLUMES = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_TIFF_VOLUMES)
-def test_wrong_tiff_volume(tmp_path, name):
-    make, words = WRONG_TIFF_VOLUMES[name]
-    path = tmp_path / "a.tif"
-    if make is not None:
-        make(path)
-    if name == "entities":  # harmless: read, not refused
-        np.testing.assert_array_equal(read_volume(path)[0], VOLUME)
-    else:
-        refusal(read_volume, path, words=words)
-
-
 def test_other_units_and_no_lateral_position(tmp_path):
+    ome(tmp_path / "a.tif", less("<OME", '<!DOCTYPE a [<!ENTITY b "c">]><OME'))
+    np.testing.assert_array_equal(read_volume(tmp_path / "a.tif")[0], VOLUME)
+
     def change(xml):
         xml = re.sub(' Position[XY](Unit)?="[^"]*"', "", xml)
         xml = xml.replace('PositionZ="18000.0" PositionZUnit="µm"', 'PositionZ="18.0" PositionZUnit="mm"')
@@ -646,13 +534,23 @@ WRONG_ZARRS = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_ZARRS)
-def test_wrong_zarr_volume(tmp_path, name):
-    make, words = WRONG_ZARRS[name]
-    path = tmp_path / "a.zarr"
+def cases():
+    for name, (make, words) in WRONG_CAPTURES.items():
+        yield pytest.param(read_capture, name, make, words, id=name)
+    for name, (content, words) in WRONG_POINTS.items():
+        make = lambda path, content=content: path.write_bytes(content)
+        yield pytest.param(read_points, "points.csv", make, words, id=f"points {name}")
+    for suffix, table in ((".tif", WRONG_TIFF_VOLUMES), (".zarr", WRONG_ZARRS)):
+        for name, (make, words) in table.items():
+            yield pytest.param(read_volume, f"a{suffix}", make, words, id=f"{suffix} {name}")
+    yield pytest.param(read_volume, "a.png", None, ["'.png'", ".tif", ".zarr"], id="suffix of a volume")
+
+
+@pytest.mark.parametrize(("read", "name", "make", "words"), list(cases()))
+def test_a_wrong_file_is_refused_in_one_line(tmp_path, read, name, make, words):
     if make is not None:
-        make(path)
-    refusal(read_volume, path, words=words)
+        make(tmp_path / name)
+    refusal(read, tmp_path / name, words=words)
 
 
 def test_ngff_05_is_read(tmp_path):
@@ -667,16 +565,10 @@ def test_ngff_05_is_read(tmp_path):
     np.testing.assert_array_equal(grid.depths, GRID.depths)
 
 
-def test_wrong_volume_names(tmp_path):
-    refusal(read_volume, tmp_path / "a.png", words=["'.png'", ".tif", ".zarr"])
-    refusal(write_volume, tmp_path / "a.nii", VOLUME, GRID, words=["'.nii'", ".tif", ".zarr"])
-    refusal(write_volume, tmp_path / "no" / "a.tif", VOLUME, GRID, words=["no folder"])
-
-
 # Writing whole or not at all
 
 
-def test_check_output(tmp_path):
+def test_check_output(tmp_path, monkeypatch):
     assert check_output(str(tmp_path / "a.TIF"), [".tif"]) == tmp_path / "a.TIF"
     assert os.listdir(tmp_path) == []
     refusal(check_output, tmp_path / "a", [".tif", ".png"], words=["''", ".tif, .png"])
@@ -689,13 +581,11 @@ def test_check_output(tmp_path):
     (tmp_path / "a.zarr").write_text("")
     refusal(check_output, tmp_path / "a.zarr", [".zarr"], words=["another kind"])
 
-
-def test_a_folder_that_may_not_be_written(tmp_path, monkeypatch):
     def denied(*args, **kwargs):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("tempfile.TemporaryFile", denied)  # the tests may run as root, whom no mode stops
-    refusal(check_output, tmp_path / "a.tif", [".tif"], words=["Permission denied"])
+    refusal(check_output, tmp_path / "b.tif", [".tif"], words=["Permission denied"])
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -740,44 +630,29 @@ def test_a_zarr_image_is_there_at_all_times(exchanged, tmp_path, monkeypatch):
     assert seen == ([] if exchanged else 2 * [False, True])
 
 
-def test_another_process_that_takes_the_name_loses_nobodys_image(tmp_path, monkeypatch):
-    """Between two renames: its folder stays, and the old one beside it."""
-    path, rename = tmp_path / "v.zarr", os.rename
-    path.mkdir()
-    (path / ".zgroup").write_text("old")
-
-    def taken(source, target):
-        rename(source, target)
-        if Path(source) == path:
-            path.mkdir()
-            (path / ".zgroup").write_text("another")
-
-    monkeypatch.setattr(files, "_exchange", lambda first, second: False)
-    monkeypatch.setattr(os, "rename", taken)
-    with pytest.raises(OSError, match=r"v\.zarr"), atomic_write(path) as temporary:
-        temporary.mkdir()
-        (temporary / ".zgroup").write_text("new")
-    texts = {(folder / ".zgroup").read_text() for folder in tmp_path.iterdir()}
-    assert (path / ".zgroup").read_text() == "another" and texts == {"another", "old"}
-
-
-def test_a_failed_rename_brings_the_old_folder_back(tmp_path, monkeypatch):
-    path = tmp_path / "a.zarr"
+@pytest.mark.parametrize("taken", [True, False])
+def test_a_failed_rename_loses_nothing(tmp_path, monkeypatch, taken):
+    """Where the system cannot exchange folders: the old image comes back, or stays beside one that took its name."""
+    path, rename, calls = tmp_path / "a.zarr", os.rename, itertools.count()
     write_volume(path, VOLUME, GRID)
-    rename, calls = os.rename, itertools.count()
 
     def second_fails(*names):
         if next(calls) == 1:
             raise OSError("the disk is gone")
         rename(*names)
 
-    monkeypatch.setattr(os, "rename", second_fails)
-    # Where the system cannot exchange two folders at once.
+    def other_takes_the_name(source, target):
+        rename(source, target)
+        if Path(source) == path:
+            (path / "0").mkdir(parents=True)
+
+    monkeypatch.setattr(os, "rename", other_takes_the_name if taken else second_fails)
     monkeypatch.setattr(files, "_exchange", lambda *_: False)
-    with pytest.raises(OSError, match="the disk is gone"):
+    with pytest.raises(OSError, match=r"a\.zarr" if taken else "the disk is gone"):
         write_volume(path, 2 * VOLUME, GRID)
-    assert os.listdir(tmp_path) == ["a.zarr"]
-    np.testing.assert_array_equal(read_volume(path)[0], VOLUME)
+    (old,) = (folder for folder in tmp_path.iterdir() if (folder / ".zattrs").exists())
+    assert (old == path) != taken and path.exists()
+    np.testing.assert_array_equal(zarr.open_group(old, mode="r")["0"][...], VOLUME)
 
 
 def test_only_an_image_in_zarr_is_replaced(tmp_path):
@@ -833,40 +708,20 @@ def test_write_protection_is_respected(tmp_path, name):
     assert mode_of(path) == mode and path.is_dir() == (name == "a.zarr")
 
 
-def test_a_bare_name_is_in_the_working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_points("a.csv", np.ones((1, 4)))
-    np.testing.assert_array_equal(read_points("a.csv"), np.ones((1, 4)))
-
-
 def test_json(tmp_path):
-    data = {
-        "far_mm": float("inf"),
-        "x": np.float32(0.5),
-        "a": np.array([1.0, np.nan]),
-        "j": jnp.arange(2),
-        "t": (1, "µ"),
-    }
-    write_json(tmp_path / "a.json", data)
-    assert json.loads((tmp_path / "a.json").read_text("utf-8")) == {
-        "far_mm": None,
-        "x": 0.5,
-        "a": [1.0, None],
-        "j": [0, 1],
-        "t": [1, "µ"],
-    }
+    data = {"far_mm": float("inf"), "x": np.float32(0.5), "a": np.array([1.0, np.nan]), "j": jnp.arange(2)}
+    write_json(tmp_path / "a.json", data | {"t": (1, "µ")})
+    plain = {"far_mm": None, "x": 0.5, "a": [1.0, None], "j": [0, 1], "t": [1, "µ"]}
+    assert json.loads((tmp_path / "a.json").read_text("utf-8")) == plain
     refusal(write_json, tmp_path / "a.txt", {}, words=[".json"])
     with pytest.raises(TypeError):
         write_json(tmp_path / "a.json", {"a": object()})
     assert len(os.listdir(tmp_path)) == 1
 
 
-def test_an_input_error_is_one_line():
-    assert str(InputError("a\nb\r\n\x1b[31mc\u2028d\x85e\n")) == "a b [31mc d e"
-
-
 def test_a_refusal_prints_nothing_else(tmp_path):
     """No log line of a decoder, no warning, reaches the terminal beside the one line."""
+    assert str(InputError("a\nb\r\n\x1b[31mc\u2028d\x85e\n")) == "a b [31mc d e"
     tiff(tmp_path / "a.tif")
     cut(tmp_path / "a.tif", 100)
     code = f"""

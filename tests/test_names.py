@@ -79,7 +79,7 @@ def test_a_gap_in_a_recording_is_told_where_time_matters(folder, monkeypatch, ca
     assert "are missing" not in run(monkeypatch, capsys, *command)[2]
 
 
-def test_psfs_that_a_shell_sorted_are_told(tmp_path):
+def test_psfs_that_a_shell_sorted_are_told(tmp_path, monkeypatch, capsys):
     paths = [tmp_path / name for name in ("z10.25.tif", "z11.tif", "z9.tif")]
     for path in paths:
         tifffile.imwrite(path, FRAMES[0, :9])
@@ -88,15 +88,11 @@ def test_psfs_that_a_shell_sorted_are_told(tmp_path):
     # A folder, and an order that is no shell's, are as they are meant.
     assert spot_names([tmp_path]) == ["z9.tif", "z10.25.tif", "z11.tif"]
     assert spot_names(paths[::-1])[0] == "z9.tif"
-
-
-def test_deconvolve_prints_order_and_depth(tmp_path, monkeypatch, capsys):
+    # The command prints order and depths.
     monkeypatch.chdir(tmp_path)
     os.mkdir("psfs")
     for name in ("z_-100um", "z_100um", "z_0um"):
-        spot = np.zeros((16, 16), np.float32)
-        spot[8, 8] = 1
-        tifffile.imwrite(f"psfs/{name}.tif", spot)
+        tifffile.imwrite(f"psfs/{name}.tif", np.eye(16, dtype=np.float32))
     tifffile.imwrite("a.tif", np.ones((16, 16), np.float32))
     command = ("deconvolve", "a.tif", "psfs", "--method", "richardson-lucy", "--steps", "1", "-o", "v.ome.tif")
     out = run(monkeypatch, capsys, *command, "--depths", "10:12:1")[1]
@@ -142,7 +138,6 @@ def test_a_recording_of_any_name(folder, monkeypatch, capsys):
     (journal := json.loads(Path(output, JOURNAL).read_text().splitlines()[0]))["request"]
     assert journal["frames"] == 2
     assert "d\\xe9sign.toml" in read_provenance(points)["command"]
-    status, out, _ = run(
-        monkeypatch, capsys, *command, "--suppress", "points", "--points", points, "--resume", "--force"
-    )
+    more = ("--suppress", "points", "--points", points, "--resume", "--force")
+    status, out, _ = run(monkeypatch, capsys, *command, *more)
     assert status == 0 and "all frames were there" in out

@@ -1,6 +1,5 @@
 """Volumes from measured stacks of PSFs: kinds of files over methods, a real capture, and what is refused."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,12 +65,13 @@ def deconvolved(*arguments: str, output: str = "v.ome.tif"):
     return CliRunner().invoke(commands, ["deconvolve", "c.tif", *arguments, "-o", output], catch_exceptions=True)
 
 
-KINDS = ("pages", "npy", "zarr", "folder", "pattern", "files")
+KINDS = ("npy", "zarr", "folder", "pattern", "files")
 
 
-@pytest.mark.parametrize("method", SOLVERS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_each_kind_of_stack_with_each_method(folder, kind, method):
+@pytest.mark.parametrize(
+    ("kind", "method"), [*(("pages", method) for method in SOLVERS), *((kind, "fista") for kind in KINDS)]
+)
+def test_each_method_and_each_kind_of_stack(folder, kind, method):
     result = deconvolved(*save(folder, kind), "--method", method, "--steps", "30", "--depths", "10:12:1")
     assert not result.exception, result.exception
     assert "3 depths from 10 to 12 mm, 40 x 48 pixels" in result.stdout
@@ -83,17 +83,16 @@ def test_each_kind_of_stack_with_each_method(folder, kind, method):
 
 
 def test_the_volume_has_the_lengths_that_are_known(folder):
-    psf = [*save(folder, "pages"), "--method", "fista"]
-    assert not deconvolved(*psf, "--steps", "2", output="plain.npy").exception
+    psf = [*save(folder, "pages"), "--method", "fista", "--steps", "30"]
+    assert not deconvolved(*psf, output="plain.npy").exception
     assert np.load("plain.npy").shape == (PLANES, *SHAPE)
-    to_scale = ("--steps", "2", "--depths", "10:12:1", "--voxel-um", "25", "--binning", "2")
     for output in ("v.ome.tif", "v.zarr"):
-        assert not deconvolved(*psf, *to_scale, output=output).exception
+        assert not deconvolved(*psf, "--depths", "10:12:1", "--voxel-um", "25", output=output).exception
         _, grid = read_volume(output)
-        assert grid.shape == (20, 24) and grid.pitch == 0.05 and list(grid.depths) == [10, 11, 12]
+        assert grid.shape == SHAPE and grid.pitch == 0.025 and list(grid.depths) == [10, 11, 12]
         assert "input psf.tif" in read_provenance(output)
-    assert not deconvolved(*psf, "--psf-page", "mean", "--steps", "2", output="plane.tif").exception
-    assert tifffile.imread("plane.tif").shape == SHAPE
+    assert not deconvolved(*psf, "--psf-page", "mean", "--binning", "2", output="plane.tif").exception
+    assert tifffile.imread("plane.tif").shape == (20, 24)
 
 
 def test_planes_may_be_uneven_and_psfs_of_unlike_size(folder):
@@ -102,7 +101,7 @@ def test_planes_may_be_uneven_and_psfs_of_unlike_size(folder):
     names = [f"p{number}.tif" for number in range(PLANES)]
     for name, psf in zip(names, psfs, strict=True):
         write_capture(name, psf)
-    unlike = ("--method", "fista", "--steps", "20", "--depths", "10,12.5,40")
+    unlike = ("--method", "fista", "--steps", "30", "--depths", "10,12.5,40")
     result = deconvolved(*names, *unlike)
     assert not result.exception and "3 depths from 10 to 40 mm, 40 x 48 pixels" in result.stdout
     assert not deconvolved(*save(folder, "pages"), *unlike, output="same.ome.tif").exception
@@ -117,13 +116,13 @@ def test_a_channel_of_a_capture_goes_with_a_grey_psf(folder, grey):
     tifffile.imwrite("c.tif", colours, photometric="rgb")
     psf = spots()[1]
     tifffile.imwrite("psf.tif", psf if grey else np.stack([psf // 9, psf, psf // 9], -1), photometric=None)
-    result = deconvolved("psf.tif", "--channel", "green", "--method", "fista", "--steps", "5", output="v.tif")
+    result = deconvolved("psf.tif", "--channel", "green", "--method", "fista", "--steps", "2", output="v.tif")
     assert not result.exception, result.exception
     assert f"{'c.tif' if grey else '2 captures'}: green of a colour image" in result.stdout
     green = tifffile.imread("v.tif")
     write_capture("c.tif", capture() // 2)
     write_capture("psf.tif", psf)
-    assert not deconvolved("psf.tif", "--method", "fista", "--steps", "5", output="v.tif").exception
+    assert not deconvolved("psf.tif", "--method", "fista", "--steps", "2", output="v.tif").exception
     np.testing.assert_array_equal(green, tifffile.imread("v.tif"))
 
 
@@ -154,12 +153,12 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("psf", ["psf", "psf/*.png"])
+@pytest.mark.parametrize("psf", ["psf", "psf/*.npy"])
 def test_no_file_of_a_stack_is_replaced(folder, psf):
-    save(folder, "folder")
+    (folder / "psf").mkdir()
     np.save("psf/z9.npy", spots()[1])
     before = (folder / "psf/z9.npy").read_bytes()
-    result = deconvolved(psf.replace("png", "npy"), "--steps", "2", output="psf/z9.npy")
+    result = deconvolved(psf, "--steps", "2", output="psf/z9.npy")
     assert isinstance(result.exception, InputError) and "the output must be another file" in str(result.exception)
     assert (folder / "psf/z9.npy").read_bytes() == before
 
@@ -182,15 +181,6 @@ def test_a_volume_that_does_not_fit_into_memory_is_refused(monkeypatch):
     monkeypatch.setattr("gs_jax.reconstruction.deconvolution.available_memory", lambda: 10**5)
     with pytest.raises(InputError, match=r"free memory, got 3 x 64 x 75 voxels, .* --binning 2 takes a quarter"):
         deconvolve(capture(), spots())
-
-
-def test_the_operator_is_batched():
-    A = ConvolutionOperator(jnp.asarray(spots(), float), SHAPE)
-    scenes = jax.random.uniform(jax.random.key(0), (2, *A.scene_shape))
-    images = jax.jit(jax.vmap(A.mv))(scenes)
-    np.testing.assert_allclose(images[1], A.mv(scenes[1]), rtol=1e-12)
-    back = jax.jit(jax.vmap(A.T.mv))(images)
-    np.testing.assert_allclose(jnp.vdot(images, images), jnp.vdot(back, scenes), rtol=1e-12)
 
 
 def test_a_real_capture_is_explained():
