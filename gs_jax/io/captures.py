@@ -89,7 +89,6 @@ def read_capture(
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> gs.write_capture("capture.tif", np.zeros((200, 300), np.uint16))
     >>> gs.read_capture("capture.tif").shape
     (200, 300)
@@ -176,7 +175,6 @@ def write_capture(
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> gs.write_capture("capture.png", np.full((200, 300), 16, np.uint16))
     """
     path = check_output(path, CAPTURE_SUFFIXES)

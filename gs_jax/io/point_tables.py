@@ -46,7 +46,6 @@ def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> gs.write_points("points.csv", np.array([[0.5, -0.4, 19.5, 1.0]]))
     >>> gs.read_points("points.csv")
     array([[ 0.5, -0.4, 19.5,  1. ]])
@@ -106,7 +105,6 @@ def write_points(
     Examples
     --------
     >>> from pathlib import Path
-    >>> import gs_jax as gs, numpy as np
     >>> gs.write_points("points.csv", np.array([[0.5, -0.4, 19.5, 1.0]]))
     >>> print(Path("points.csv").read_text(), end="")
     x_mm,y_mm,z_mm,intensity

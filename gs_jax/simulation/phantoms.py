@@ -73,8 +73,6 @@ def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> F
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
-    >>> grid = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
     >>> volume = gs.rasterize(np.array([[0.05, 0.0, 21.0, 1.0]]), grid)  # between two voxels and two planes
     >>> print(round(float(volume.sum()), 3), int((volume > 0.2).sum()))
     1.0 4

@@ -91,11 +91,6 @@ def simulate(
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
     >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
     >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
     >>> image.shape
@@ -233,7 +228,6 @@ class Camera(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> camera = gs.Camera(gain=2.5, offset=100.0, read_noise=1.6, full_well=10_000.0, bits=12)
     """
 
@@ -283,7 +277,7 @@ def expose(
 
     Examples
     --------
-    >>> import gs_jax as gs, jax, numpy as np
+    >>> import jax
     >>> counts = gs.expose(np.eye(64), gs.Camera(), jax.random.key(0), peak_electrons=10_000)
     >>> print(counts.dtype, round(float(np.median(counts))))  # dark pixels: the offset
     uint16 16
