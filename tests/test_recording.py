@@ -17,9 +17,7 @@ from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
 from gs_jax.io import ngff, volume_series
-from gs_jax.io.captures import Selection
 from gs_jax.io.provenance import read_provenance
-from gs_jax.io.recordings import open_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halve
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.pipeline import reconstruct
@@ -53,6 +51,17 @@ def save(name, frames=FRAMES):
 
 def command(name, *options, output="v.zarr"):
     return ("reconstruct", name, "design.toml", *OPTIONS, "-o", output, *options)
+
+
+def bead_frames(places):
+    """Frames of beads at these x in each, 20 mm deep."""
+    scope = read_design("design.toml").imager()
+    frames = np.full((len(places), 96, 80), 16, np.uint16)
+    for frame, x in ((frame, x) for frame, row in zip(frames, places, strict=True) for x in row):
+        spots = np.asarray(scope.sensor.to_pixels(scope.project(np.array([[x, 0, 20.0]]))))[:, 0]
+        for row, column in spots.round().astype(int):
+            frame[row - 1 : row + 2, column - 1 : column + 2] = 1000
+    return frames
 
 
 def beside_progress(err):
@@ -242,12 +251,7 @@ def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
 
 @pytest.mark.integration
 def test_points_of_all_frames_in_one_table(folder, monkeypatch, capsys):
-    scope = read_design("design.toml").imager()
-    frames = np.full((3, 96, 80), 16, np.uint16)
-    for frame in (0, 2):
-        for row, column in np.asarray(scope.sensor.to_pixels(scope.project(np.array([[0.1 * frame, 0, 20.0]]))))[:, 0]:
-            frames[frame, round(row) - 1 : round(row) + 2, round(column) - 1 : round(column) + 2] = 1000
-    save("rec.tif", frames)
+    save("rec.tif", bead_frames([[0.0], [], [0.2]]))
     how = ("--suppress", "clusters", "--points", "p.csv")
     assert run(monkeypatch, capsys, *command("rec.tif", *how))[0] == 0
     header, *rows = (folder / "p.csv").read_text().splitlines()
@@ -304,15 +308,6 @@ def test_what_is_no_recording_is_said(folder, monkeypatch, capsys, name, options
     status, _, err = run(monkeypatch, capsys, *command(name, *options))
     assert status == 2 and words in err and len(err) < 400
     assert not any((folder / each).exists() for each in ("v.zarr", "v.ome.tif"))
-
-
-def test_ome_zarr_with_channel_and_depth_is_a_recording(tmp_path):
-    attributes = {"multiscales": [{"axes": [{"name": n} for n in "tczyx"], "datasets": [{"path": "full"}]}]}
-    group = zarr.create_group(tmp_path / "a", zarr_format=2, attributes=attributes)
-    group.create_array("full", data=FRAMES[:, None, None])
-    with open_recording(tmp_path / "a") as recording:
-        assert recording is not None and len(recording.names) == 5
-        np.testing.assert_array_equal(next(recording.images(3, Selection())), FRAMES[3])
 
 
 def test_memory_is_bounded_and_work_overlaps(tmp_path):

@@ -8,12 +8,11 @@ import pytest
 import tifffile
 
 from gs_jax.base.errors import InputError
-from gs_jax.design.design import read_design
 from gs_jax.detection.linking import MEMORY, link_particles
 from gs_jax.io.point_tables import read_points
 
 from .test_cli import folder, run
-from .test_recording import command
+from .test_recording import bead_frames, command
 
 __all__ = ["folder"]
 
@@ -64,15 +63,8 @@ def test_crowds_are_refused():
 @needs_trackpy
 def test_beads_of_a_recording(folder, monkeypatch, capsys):
     """Two that move, of which one is dark in a frame, and frames of which one cannot be read."""
-    scope = read_design("design.toml").imager()
-    frames = np.full((5, 96, 80), 16, np.uint16)
-    for frame in range(5):
-        for x in (-0.3 + 0.05 * frame, 0.3)[: 1 if frame == 2 else 2]:
-            spots = np.asarray(scope.sensor.to_pixels(scope.project(np.array([[x, 0, 20.0]]))))[:, 0]
-            for row, column in spots.round().astype(int):
-                frames[frame, row - 1 : row + 2, column - 1 : column + 2] = 1000
     (folder / "frames").mkdir()
-    for frame, image in enumerate(frames):
+    for frame, image in enumerate(bead_frames([(-0.3 + 0.05 * t, 0.3)[: 1 if t == 2 else 2] for t in range(5)])):
         tifffile.imwrite(f"frames/{frame}.tif", image[:50] if frame == 3 else image)
     how = ("--suppress", "clusters", "--points", "p.csv", "--track", "120", "--depths", "20")
     status, out, err = run(monkeypatch, capsys, *command("frames", *how))

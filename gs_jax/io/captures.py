@@ -1,12 +1,13 @@
 """Reads and writes captures: greyscale TIFF, PNG or .npy of uint8, uint16 or float32, or one page or colour of a file.
 
 Size and type are checked as the file declares them, before pixels are decoded. To add a format, add its suffix to
-`CAPTURE_SUFFIXES`, a function that reads it to `_READERS`, and how it is written to `write_capture`.
+`CAPTURE_SUFFIXES`, how it is opened to `open_source`, and how it is written to `write_capture`.
 """
 
+import contextlib
 import json
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike
-from .axes import stack_axis, stack_error
+from .axes import UNNAMED, stack_axis, stack_error
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .provenance import KEY, Provenance, write_sidecar
 from .tiff import Tiff, decode_plane, mosaic_pattern, open_tiff
@@ -43,6 +44,21 @@ _TIFF_COLOURS = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palet
 
 class GreyError(InputError):
     """A channel was selected of an image that is grey."""
+
+
+class Source(NamedTuple):
+    """Images of an open file or store, in the order that it declares.
+
+    `axes` are names and lengths of its axes before y and x, and `size` its rows and columns, as it declares them;
+    `names` are those of the images, for messages; `read` reads the selected part of an image, counted from 0; `files`
+    are those that are read, except the many of a Zarr store.
+    """
+
+    axes: list[tuple[str, int]]
+    size: tuple[int, ...]
+    names: list[str]
+    read: Callable[[int, "Selection"], np.ndarray]
+    files: list[Path]
 
 
 class Selection(NamedTuple):
@@ -108,12 +124,33 @@ def average(images: Iterable[Shaped[np.ndarray, "row column"]]) -> Shaped[np.nda
 
 def read_images(path: PathLike, selection: Selection = Selection()) -> Images:
     """Yield the selected pages of a capture, of a mosaic with all of its pixels; errors as `read_capture`."""
-    path = check_input(path)
-    read = _READERS[check_suffix(path, CAPTURE_SUFFIXES)]
+    path, page = check_input(path), selection.page
+    check_suffix(path, CAPTURE_SUFFIXES)
     if selection.bayer:
         mosaic_sites(selection.bayer, selection.channel)
-    shape = selection.shape
-    yield from check_images(path, read(path, selection._replace(shape=shape and tuple(shape))))
+    shape = selection.shape and tuple(selection.shape)
+    with open_source(path, page) as source:
+        if page == REPEATS:
+            check_stack(path, source, "tz", "; its images are not repeats of one")
+        indices = _pages(path, len(source.names), page)
+        yield from check_images(path, (source.read(index, selection._replace(shape=shape)) for index in indices))
+
+
+@contextlib.contextmanager
+def open_source(path: Path, page: int | str | None = None) -> Iterator[Source]:
+    """Open the images of a file; those of a TIFF are its pages if one is chosen by its number."""
+    suffix = path.suffix.lower()
+    if suffix in TIFF_SUFFIXES:
+        with open_tiff(path) as tiff:
+            yield _tiff_source(tiff, page)
+    elif suffix == ".npy":
+        pixels = open_npy(path)
+        pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
+        names = [f"{path.name}, page {page}" for page in range(1, len(pages) + 1)]
+        read = lambda index, selection: _read_array(path, pages[index], selection)
+        yield Source([(UNNAMED, len(pages))], pages.shape[1:], names, read, [path])
+    else:
+        yield Source([(UNNAMED, 1)], (), [path.name], lambda _, selection: _read_png(path, selection), [path])
 
 
 def check_images(path: PathLike, images: Images) -> Images:
@@ -270,7 +307,7 @@ def _select_channel(pixels: np.ndarray, channel: str | None, axis: int = -1) -> 
     return pixels if pixels.ndim == 2 else np.take(pixels, CHANNELS.index(channel or ""), axis)
 
 
-def read_tiff_page(tiff: Tiff, index: int, selection: Selection) -> np.ndarray:
+def _read_tiff_page(tiff: Tiff, index: int, selection: Selection) -> np.ndarray:
     """The selected part of a page, counted from 0."""
     path = tiff.path
     with decoding(path, "TIFF"):
@@ -292,34 +329,30 @@ def read_tiff_page(tiff: Tiff, index: int, selection: Selection) -> np.ndarray:
     return _select_channel(decode_plane(tiff, index), selection.channel, 0 if planar else -1)
 
 
-def _read_tiff(path: Path, selection: Selection) -> Iterator[np.ndarray]:
-    with open_tiff(path) as tiff:
-        for number, image in enumerate(_chosen(tiff, selection.page)):
-            yield read_tiff_page(*tiff.at(image, number), selection)
-
-
-def _chosen(tiff: Tiff, page: int | str | None) -> list[tuple[Path, int] | None]:
-    """File and page of each selected image. A page by its number is one of the file, whatever this says of it."""
+def _tiff_source(tiff: Tiff, page: int | str | None) -> Source:
+    # A page by its number is one of the file, whatever this says of it.
+    axes, images = [(UNNAMED, tiff.count)], [(tiff.path, index) for index in range(tiff.count)]
     if page == OWN and tiff.count == 1:
         tiff.check_alone()
-        return [(tiff.path, 0)]
-    if isinstance(page, int):
-        return [(tiff.path, index) for index in _pages(tiff.path, tiff.count, page)]
-    if page == REPEATS:
-        check_stack(tiff, "tz", "; its images are not repeats of one")
-    images = tiff.stack.images
-    return [images[index] for index in _pages(tiff.path, len(images), page)]
+    elif not isinstance(page, int):
+        axes, images = tiff.stack
+
+    def read(index: int, selection: Selection) -> np.ndarray:
+        return _read_tiff_page(*tiff.at(images[index], index), selection)
+
+    names = [f"{image[0].name}, page {image[1] + 1}" if image else f"{tiff.path.name}, no page" for image in images]
+    files = list(dict.fromkeys([tiff.path, *(image[0] for image in images if image)]))
+    return Source(axes, (tiff.first.imagelength, tiff.first.imagewidth), names, read, files)
 
 
-def check_stack(tiff: Tiff, axes: str, advice: str) -> None:
-    """Raise `InputError` unless the images of a TIFF follow each other along one of some axes, as `stack_axis`."""
-    names, lengths = zip(*tiff.stack.axes, strict=True)
-    if stack_axis(tiff.stack.axes, axes) is None:
-        shape = (*lengths, tiff.first.imagelength, tiff.first.imagewidth)
-        raise stack_error(tiff.path, axes, shape, (*names, "y", "x"), advice)
+def check_stack(path: Path, source: Source, axes: str, advice: str = "") -> None:
+    """Raise `InputError` unless the images of a source follow each other along one of some axes, as `stack_axis`."""
+    if stack_axis(source.axes, axes) is None or not source.names:
+        names, lengths = zip(*source.axes, strict=True)
+        raise stack_error(path, axes, (*lengths, *source.size), (*names, "y", "x"), advice)
 
 
-def _read_png(path: Path, selection: Selection) -> Iterator[np.ndarray]:
+def _read_png(path: Path, selection: Selection) -> np.ndarray:
     with path.open("rb") as file:
         header = file.read(26)
     if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or header[12:16] != b"IHDR":
@@ -333,8 +366,7 @@ def _read_png(path: Path, selection: Selection) -> Iterator[np.ndarray]:
         pixels = _decode_png(path, image, bits)
     if count != 1:
         raise input_error("PNG", "one image", f"{count} pages", path)
-    _pages(path, 1, selection.page)
-    yield _select_channel(pixels.astype(dtype), selection.channel)
+    return _select_channel(pixels.astype(dtype), selection.channel)
 
 
 def _decode_png(path: Path, image: ImageFile.ImageFile, bits: int) -> np.ndarray:
@@ -349,16 +381,11 @@ def _decode_png(path: Path, image: ImageFile.ImageFile, bits: int) -> np.ndarray
     return halves[0] << 8 | halves[1]
 
 
-def _read_npy(path: Path, selection: Selection) -> Iterator[np.ndarray]:
-    pixels = open_npy(path)
-    pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
+def _read_array(path: Path, pixels: np.ndarray, selection: Selection) -> np.ndarray:
+    """An image of an array in a file, which is read after its size and type are checked."""
     check_colour(path, None, selection)
-    for index in _pages(path, len(pages), selection.page):
-        check_declared(path, pages[index].shape, pixels.dtype.name, selection)
-        yield np.array(pages[index])
-
-
-_READERS = {**dict.fromkeys(TIFF_SUFFIXES, _read_tiff), ".png": _read_png, ".npy": _read_npy}
+    check_declared(path, pixels.shape, pixels.dtype.name, selection)
+    return np.array(pixels)
 
 
 def summarise(path: Path) -> dict[str, str]:

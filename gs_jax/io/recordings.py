@@ -6,6 +6,7 @@ measured stack of PSFs, are read in the same way.
 
 import contextlib
 import glob
+import math
 import os
 import re
 import warnings
@@ -17,7 +18,7 @@ import numpy as np
 
 from ..base.errors import InputError, InputWarning
 from ..typing import PathLike
-from .axes import UNNAMED, axis_letter, stack_axis, stack_error
+from .axes import UNNAMED, axis_letter, stack_error
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
 from .captures import (
     CAPTURE_SUFFIXES,
@@ -25,18 +26,17 @@ from .captures import (
     GreyError,
     Images,
     Selection,
+    Source,
     check_colour,
     check_declared,
     check_images,
     check_stack,
-    open_npy,
+    open_source,
     read_images,
-    read_tiff_page,
 )
 from .files import TIFF_SUFFIXES, check_input, decoding
 from .names import natural_order
 from .ngff import import_zarr, missing_chunk, ngff_attributes
-from .tiff import Tiff, open_tiff
 
 _ZARR_ROOTS = (".zarray", ".zgroup", "zarr.json")
 
@@ -87,38 +87,27 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
     path = Path(path)
     suffix = path.suffix.lower()
     if path.is_dir() and (suffix == ".zarr" or any((path / name).exists() for name in _ZARR_ROOTS)):
-        yield _open_zarr(path, page, axes)
+        if page is not None:
+            raise InputError(f"--page must not be given for a recording in Zarr, got --page {page} ({path}).")
+        yield _recording(path, _zarr_source(path, axes), axes)
     elif (files := capture_files(path)) is not None:
         yield _open_files(path, files, page)
     elif page is not None or suffix not in (*TIFF_SUFFIXES, ".npy"):
         yield None
-    elif suffix == ".npy":
-        shape = open_npy(check_input(path)).shape
-        yield _open_npy(path, shape[0]) if len(shape) == 3 and shape[0] > 1 else None
     else:
-        with open_tiff(check_input(path)) as tiff:
-            yield _open_pages(tiff, axes) if len(tiff.stack.images) > 1 else None
+        advice = "; --page takes one image; if all follow each other, save them with the axes TYX"
+        with open_source(check_input(path)) as source:
+            yield _recording(path, source, axes, advice) if len(source.names) > 1 else None
 
 
-def _open_pages(tiff: Tiff, axes: str) -> Recording:
-    """The images of a TIFF, and of the further files of its set, in the order that it declares."""
-    advice = "; --page takes one image; if all follow each other, save them with the axes TYX"
-    check_stack(tiff, axes, advice)
-    images = tiff.stack.images
+def _recording(path: Path, source: Source, axes: str, advice: str = "") -> Recording:
+    """The images of a file or a store as frames; `InputError` if they lie along other axes than these."""
+    check_stack(path, source, axes, advice)
 
-    def read(index: int, selection: Selection) -> Images:
-        yield read_tiff_page(*tiff.at(images[index], index), selection)
+    def images(index: int, selection: Selection) -> Images:
+        return check_images(path, (source.read(frame, selection) for frame in [index]))
 
-    names = [f"{image[0].name}, page {image[1] + 1}" if image else f"{tiff.path.name}, no page" for image in images]
-    files = list(dict.fromkeys([tiff.path, *(image[0] for image in images if image)]))
-    return Recording(names, lambda index, selection: check_images(tiff.path, read(index, selection)), files)
-
-
-def _open_npy(path: Path, count: int) -> Recording:
-    def read(index: int, selection: Selection) -> Images:
-        return read_images(path, selection._replace(page=index + 1))
-
-    return Recording([f"{path.name}, page {page}" for page in range(1, count + 1)], read, [path])
+    return Recording(source.names, images, source.files)
 
 
 def capture_files(path: Path) -> list[Path] | None:
@@ -157,35 +146,32 @@ def _open_files(path: Path, files: list[Path], page: int | str | None) -> Record
     return Recording([file.name for file in files], read, files)
 
 
-def _open_zarr(path: Path, page: int | str | None, allowed: str) -> Recording:
+def _zarr_source(path: Path, allowed: str) -> Source:
+    """The images of a Zarr array; `InputError` if there is none, or it is none of `allowed` axes, rows and columns."""
     zarr = import_zarr()
-    if page is not None:
-        raise InputError(f"--page must not be given for a recording in Zarr, got --page {page} ({path}).")
     with decoding(path, "Zarr store"):
         store = _only_series(zarr.open(path, mode="r"))
         array = store if isinstance(store, zarr.Array) else _image_array(store)
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: no image; must be a Zarr array (t, y, x), or OME-Zarr of one image.")
     shape, names = array.shape, _axes(store, array)
-    stack = list(zip(names, shape, strict=True))[:-2]
-    axis = stack_axis(stack, allowed) if stack else None
-    if axis is None or not shape[axis] or names[-2:] not in (["y", "x"], [UNNAMED] * 2):
+    if len(shape) < 3 or names[-2:] not in (["y", "x"], [UNNAMED] * 2):
         raise stack_error(path, allowed, shape, names)
 
-    def read(index, selection):
+    def read(index: int, selection: Selection) -> np.ndarray:
         check_colour(path, None, selection)
         check_declared(path, shape[-2:], array.dtype.name, selection)
-        place = tuple(index if number == axis else 0 for number in range(len(stack)))
+        place = tuple(map(int, np.unravel_index(index, shape[:-2])))
         with decoding(path, "Zarr array"):
             missing = missing_chunk(array, place)
             image = None if missing else np.asarray(array[place])
         if image is None:
             advice = "if it is dark there, write it with write_empty_chunks=True"
             raise InputError(f"{path}: frame {index + 1} is incomplete: there is no chunk {missing}; {advice}.")
-        yield image
+        return image
 
-    labels = [f"{path.name}, frame {frame}" for frame in range(1, shape[axis] + 1)]
-    return Recording(labels, lambda index, selection: check_images(path, read(index, selection)), [])
+    frames = [f"{path.name}, frame {frame}" for frame in range(1, math.prod(shape[:-2]) + 1)]
+    return Source(list(zip(names, shape[:-2], strict=False)), shape[-2:], frames, read, [])
 
 
 def _only_series(store):
