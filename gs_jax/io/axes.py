@@ -67,8 +67,8 @@ def stack_error(path: Path, allowed: str, shape: Sequence[int], names: Sequence[
     """The error of a stack with other axes than `allowed`; `shape` and `names` are those of all of its axes."""
     first = allowed[-1]
     named = f" ({', '.join(names)})" if any(name not in (UNNAMED, "y", "x") for name in names) else ""
-    wanted = f"({first}, y, x), with axes of 1 alone between {first} and y"
-    return input_error("array", wanted, f"{' x '.join(map(str, shape))}{named}{advice}", path)
+    expected = f"({first}, y, x), with axes of 1 alone between {first} and y"
+    return input_error("array", expected, f"{' x '.join(map(str, shape))}{named}{advice}", path)
 
 
 class OmePlanes(NamedTuple):
@@ -127,7 +127,7 @@ def _planes(path: Path, pixels: ElementTree.Element, own: str | None, pages: int
         raise ValueError(f"order {order}")
     planes: list[tuple[Path, int] | None] = [None] * count
     elements = pixels.findall("{*}TiffData") or [ElementTree.Element("TiffData")]
-    names = {name for each in elements if (name := _file_name(each))}
+    names = {name for element in elements if (name := _file_name(element))}
     for element in elements:
         uuid = element.find("{*}UUID")
         file, known = path, pages
@@ -141,9 +141,9 @@ def _planes(path: Path, pixels: ElementTree.Element, own: str | None, pages: int
         first, step = 0, 1
         for axis in order:
             first, step = first + int(element.get(f"First{axis}", 0)) * step, step * lengths[axis]
-        for place in range(first, min(first + number, count)):
-            if page + place - first < known:
-                planes[_row_major(place, order, lengths)] = (file, page + place - first)
+        for index in range(first, min(first + number, count)):
+            if page + index - first < known:
+                planes[_row_major(index, order, lengths)] = (file, page + index - first)
     size = int(pixels.attrib["SizeY"]), int(pixels.attrib["SizeX"])
     return OmePlanes({axis.lower(): n for axis, n in lengths.items()}, size, planes)
 
@@ -155,11 +155,11 @@ def _file_name(element: ElementTree.Element) -> str | None:
     return name and PurePath(name.replace("\\", "/")).name
 
 
-def _row_major(place: int, order: list[str], lengths: dict[str, int]) -> int:
+def _row_major(number: int, order: list[str], lengths: dict[str, int]) -> int:
     """Number of a plane with z as the fastest axis, then c, from that in the declared order, fastest first."""
     at = {}
     for axis in order:
-        place, at[axis] = divmod(place, lengths[axis])
+        number, at[axis] = divmod(number, lengths[axis])
     return (at["T"] * lengths["C"] + at["C"]) * lengths["Z"] + at["Z"]
 
 
@@ -175,13 +175,13 @@ def read_ndtiff(path: Path) -> tuple[list[tuple[str, int]], list[tuple[Path, int
         entries = [(entry[0], PurePath(entry[1]).name) for entry in tifffile.read_ndtiff_index(index)]
         if path.name not in {name for _, name in entries}:
             return None
-        # Places along an axis are numbers, or names in the order in which they came.
-        places: dict[str, dict] = {}
+        # Positions along an axis are numbers, or names in the order in which they came.
+        positions: dict[str, dict] = {}
         for at, _ in entries:
-            for axis, place in at.items():
-                places.setdefault(axis, {}).setdefault(place)
-        axes = sorted(places, key=lambda axis: "tcz".find(_letter(axis)))
-        numbers = {axis: _numbered(list(places[axis])) for axis in axes}
+            for axis, position in at.items():
+                positions.setdefault(axis, {}).setdefault(position)
+        axes = sorted(positions, key=lambda axis: "tcz".find(_letter(axis)))
+        numbers = {axis: _numbered(list(positions[axis])) for axis in axes}
         lengths = [(_letter(axis), 1 + max(numbers[axis].values())) for axis in axes]
         count = math.prod(length for _, length in lengths)
         if count > _MAX_PLANES:
@@ -204,8 +204,8 @@ def _letter(axis: str) -> str:
     return axis if axis in ("row", "column") else axis_letter(axis)
 
 
-def _numbered(places: list) -> dict:
-    """Numbers of places along an axis; where these are numbers, with room for those that the index lacks."""
-    if all(isinstance(place, int) for place in places):
-        return {place: place - min(places) for place in places}
-    return {place: number for number, place in enumerate(places)}
+def _numbered(positions: list) -> dict:
+    """Numbers of positions along an axis; where these are numbers, with room for those that the index lacks."""
+    if all(isinstance(position, int) for position in positions):
+        return {position: position - min(positions) for position in positions}
+    return {position: number for number, position in enumerate(positions)}

@@ -226,8 +226,7 @@ def prepare(
         images = read_images(path, Selection(shape, REPEATS, readout.channel, readout.bayer))
         image, _, more = _average(path, images, readout)
         warnings.extend(more)
-        _check_size(path, image, size)
-        return image
+        return _checked_size(path, image, size)
 
     def mark(pixels: np.ndarray, where: str) -> None:
         bad[pixels] = True
@@ -309,20 +308,22 @@ def _average(name: PathLike, images, readout: Readout) -> tuple[np.ndarray, list
     done = [f"mean of {len(sizes)} pages"] if len(sizes) > 1 else []
     if not any(saturated):
         return image, done, []
-    count, value = sum(each[0] for each in saturated if each), max(each[1] for each in saturated if each)
+    counts, values = zip(*filter(None, saturated), strict=True)
+    count, value = sum(counts), max(values)
     share = f"{count} pixels ({count / sum(sizes):.2g} of all)"
     return image, done, [f"{name}: {share} are saturated at {value}: the camera cut off their light"]
 
 
-def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
+def _checked_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if image.shape != size:
         raise input_error("image", f"{size_text(size)} pixels, as the capture", size_text(image.shape), path)
+    return image
 
 
 def _read_mask(path: Path, size, shape, readout: Readout) -> Bool[np.ndarray, "row column"]:
     image = average(read_images(path, Selection(shape, None, readout.channel, readout.bayer, _MASK_DTYPES)))
-    bad = (mosaic_channel(image, readout.bayer, readout.channel) if readout.bayer else image) != 0
-    _check_size(path, bad, size)
+    image = mosaic_channel(image, readout.bayer, readout.channel) if readout.bayer else image
+    bad = _checked_size(path, image, size) != 0
     if bad.mean() > 0.5:  # a mask that marks good pixels
         raise input_error("bad pixels", "at most half of all, with 0 for good ones", f"{bad.mean():.0%}", path)
     return bad
@@ -354,9 +355,9 @@ def find_hot_in_dark(dark: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "r
     middle = float(np.median(dark))
     deviation = max(1.4826 * float(np.median(np.abs(dark - middle))), _ROUNDING)
     hot = dark > middle + _HOT * deviation
-    for part in _parts(np.argwhere(hot)):
-        local = np.median(_neighbourhoods(dark, part, 2), axis=1)
-        hot[tuple(part.T)] = dark[tuple(part.T)] > local + _HOT * deviation
+    for pixels in _in_parts(np.argwhere(hot)):
+        local = np.median(_neighbourhoods(dark, pixels, 2), axis=1)
+        hot[tuple(pixels.T)] = dark[tuple(pixels.T)] > local + _HOT * deviation
     return hot
 
 
@@ -372,9 +373,9 @@ def find_hot_in_capture(image: Num[np.ndarray, "row column"]) -> Bool[np.ndarray
     # Noiseless images have bright pixels, too.
     least = (float(image.max()) - level) / 100 if image.dtype.kind == "f" else _BRIGHT * _ROUNDING
     hot = image > level + max(_BRIGHT * noise, least)
-    for part in _parts(np.argwhere(hot)):
-        brightest = np.delete(_neighbourhoods(image, part, 1), 4, axis=1).max(1)
-        hot[tuple(part.T)] = brightest - level < _NEIGHBOUR * (image[tuple(part.T)] - level)
+    for pixels in _in_parts(np.argwhere(hot)):
+        brightest = np.delete(_neighbourhoods(image, pixels, 1), 4, axis=1).max(1)
+        hot[tuple(pixels.T)] = brightest - level < _NEIGHBOUR * (image[tuple(pixels.T)] - level)
     return hot
 
 
@@ -388,23 +389,23 @@ def fill_bad_pixels(
     image, bad = np.array(image, np.float32), bad.copy()
     if bad.all():
         raise ValueError("`bad` must leave a good pixel.")
-    places = np.argwhere(bad)
-    while len(places):
-        near = np.where(_neighbourhoods(bad, places, 1), np.nan, _neighbourhoods(image, places, 1))
+    pixels = np.argwhere(bad)
+    while len(pixels):
+        near = np.where(_neighbourhoods(bad, pixels, 1), np.nan, _neighbourhoods(image, pixels, 1))
         reached = ~np.isnan(near).all(1)
-        filled = tuple(places[reached].T)
+        filled = tuple(pixels[reached].T)
         image[filled], bad[filled] = np.nanmedian(near[reached], axis=1), False
-        places = places[~reached]
+        pixels = pixels[~reached]
     return image
 
 
-def _parts(places):
+def _in_parts(pixels):
     """Split pixels into parts whose neighbourhoods need little memory."""
-    return np.array_split(places, len(places) // 100_000 + 1)
+    return np.array_split(pixels, len(pixels) // 100_000 + 1)
 
 
-def _neighbourhoods(image, places, reach):
+def _neighbourhoods(image, pixels, reach):
     """Squares around pixels, `(place, pixel)`; beyond the image's edge its nearest pixels."""
     offsets = np.stack(np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"), -1).reshape(1, -1, 2)
-    near = np.clip(places[:, None] + offsets, 0, np.array(image.shape) - 1)
+    near = np.clip(pixels[:, None] + offsets, 0, np.array(image.shape) - 1)
     return image[near[..., 0], near[..., 1]]

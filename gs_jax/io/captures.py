@@ -174,7 +174,7 @@ def mosaic_sites(bayer: str, channel: str | None) -> list[tuple[int, int]]:
         raise input_error("--bayer", ", ".join(PATTERNS), short_repr(bayer))
     if channel not in CHANNELS:
         raise input_error(f"--channel with --bayer {bayer}", ", ".join(CHANNELS), channel or "none")
-    return [divmod(place, 2) for place, colour in enumerate(bayer) if colour == channel[0].upper()]
+    return [divmod(index, 2) for index, colour in enumerate(bayer) if colour == channel[0].upper()]
 
 
 def mosaic_channel(

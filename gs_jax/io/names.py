@@ -74,7 +74,7 @@ def natural_order(names: Iterable[Name]) -> list[Name]:
     names = list(names)
     pieces = [_pieces(str(name)) for name in names]
     decimals, texts, units = defaultdict(set), set(), set()
-    for piece in (piece for each in pieces for piece in each[0]):
+    for piece in (piece for own, *_ in pieces for piece in own):
         texts.add(piece.before)
         if piece.decimals:
             decimals[piece.before].add(piece.decimals)
@@ -83,8 +83,8 @@ def natural_order(names: Iterable[Name]) -> list[Name]:
     counted = {before for before, digits in decimals.items() if not _are_decimals(digits)}
     keys = [
         # Text and numbers alternate, also where a name ends and another goes on.
-        [*(part for piece in each for part in _key(piece, texts, counted, len(units) > 1)), rest, -math.inf, suffix]
-        for each, rest, suffix in pieces
+        [*(item for piece in own for item in _key(piece, texts, counted, len(units) > 1)), rest, -math.inf, suffix]
+        for own, rest, suffix in pieces
     ]
     order = sorted(range(len(names)), key=lambda i: (keys[i], str(names[i])))
     return [names[i] for i in order]
@@ -96,10 +96,10 @@ def _pieces(name: str) -> tuple[list[_Piece], str, str]:
     suffix = "" if suffix[1:].isdigit() else suffix
     stem = name.removesuffix(suffix)
     # Numbers with two points are versions or dates.
-    found = list(re.finditer(r"(?<![\d.,])(\d+)(?:[.,]|p(?=\d+[nmcuµμ]m))(\d+)(?![.,]?\d)|(\d+)", stem))
+    numbers = list(re.finditer(r"(?<![\d.,])(\d+)(?:[.,]|p(?=\d+[nmcuµμ]m))(\d+)(?![.,]?\d)|(\d+)", stem))
     pieces, end = [], 0
-    for number, match in enumerate(found):
-        following = found[number + 1].start() if number + 1 < len(found) else len(stem)
+    ends = [*(match.start() for match in numbers[1:]), len(stem)]
+    for match, following in zip(numbers, ends, strict=False):
         whole, decimals = match[1] or match[3], match[2] or ""
         pieces.append(_Piece(not pieces, stem[end : match.start()], whole, decimals, stem[match.end() : following]))
         end = match.end()
@@ -107,7 +107,7 @@ def _pieces(name: str) -> tuple[list[_Piece], str, str]:
 
 
 def _are_decimals(digits: set[str]) -> bool:
-    return len({len(each) for each in digits}) == 1 or not any(each.endswith("0") and each != "0" for each in digits)
+    return len(set(map(len, digits))) == 1 or not any(text.endswith("0") and text != "0" for text in digits)
 
 
 def _key(piece: _Piece, texts: set[str], counted: set[str], has_units: bool) -> list:
@@ -129,15 +129,15 @@ def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
     In the series all but one whole number is the same in each name.
     """
     split = [re.split(r"(\d+)", name) for name in names]
-    if len({len(each) for each in split}) != 1 or len(names) < 3:
+    if len(set(map(len, split))) != 1 or len(names) < 3:
         return None
-    varying = [place for place, parts in enumerate(zip(*split, strict=True)) if len(set(parts)) > 1]
+    varying = [index for index, texts in enumerate(zip(*split, strict=True)) if len(set(texts)) > 1]
     if len(varying) != 1 or varying[0] % 2 == 0:
         return None
-    numbers = [int(each[varying[0]]) for each in split]
+    numbers = [int(texts[varying[0]]) for texts in split]
     steps = [after - before for before, after in zip(numbers[:-1], numbers[1:], strict=True)]
     # Times in names differ a little from step to step.
-    gap = next((place for place, step in enumerate(steps) if step >= 1.75 * min(steps)), None)
+    gap = next((index for index, step in enumerate(steps) if step >= 1.75 * min(steps)), None)
     return None if gap is None or min(steps) < 1 else (names[gap], names[gap + 1])
 
 

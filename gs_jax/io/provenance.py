@@ -105,8 +105,8 @@ def _from_tiff(path: Path) -> dict:
     if not text.startswith(("<?xml", "<OME")):
         return {}
     annotations = ElementTree.fromstring(text).iterfind("{*}StructuredAnnotations/{*}MapAnnotation")
-    ours = [each for each in annotations if each.get("Namespace") == NAMESPACE]
-    return {pair.get("K", ""): pair.text or "" for each in ours for pair in each.iterfind("{*}Value/{*}M")}
+    ours = [annotation for annotation in annotations if annotation.get("Namespace") == NAMESPACE]
+    return {pair.get("K", ""): pair.text or "" for own in ours for pair in own.iterfind("{*}Value/{*}M")}
 
 
 def _from_png(path: Path) -> dict:

@@ -445,9 +445,9 @@ def read_surface(path: PathLike) -> SurfaceMaps:
     path = check_input(path)
     with open_tiff(path, "OME-TIFF") as tiff:
         with decoding(path, "OME-TIFF"):
-            words = tiff.first.description
-            pixels = ElementTree.fromstring(words).find("{*}Image/{*}Pixels") if words.startswith("<?xml") else None
-        names = [] if pixels is None else [each.get("Name", "") for each in pixels.findall("{*}Channel")]
+            text = tiff.first.description
+            pixels = ElementTree.fromstring(text).find("{*}Image/{*}Pixels") if text.startswith("<?xml") else None
+        names = [] if pixels is None else [channel.get("Name", "") for channel in pixels.findall("{*}Channel")]
         planes = [decode_plane(*tiff.at(image, number)) for number, image in enumerate(tiff.stack.images)]
         with decoding(path, "OME-TIFF"):
             maps = np.stack(planes)
