@@ -9,10 +9,9 @@ from pydantic import Field, Tag, ValidationError
 
 from ..base.errors import InputError, errors_name_file
 from ..geometry import LONGEST, SHORTEST
-from ..io.files import write_text
 from ..io.names import PIXELS, in_mm, unit_of_name
-from ..io.point_tables import read_columns
-from ..io.provenance import Provenance, write_sidecar
+from ..io.point_tables import read_columns, write_rows
+from ..io.provenance import Provenance
 from ..io.toml import EACH, NAME, ONE, Table, number_or_name, one_line, one_or_each
 from ..lenses import Orientation
 from ..materials import MATERIALS
@@ -408,6 +407,4 @@ def write_centers(path: PathLike, centers: Float[np.ndarray, "lens 2"], provenan
 
     Raises `InputError` as `check_output`, for `.csv`.
     """
-    rows = [",".join(map(str, row)) for row in centers.tolist()]
-    write_text(path, "\n".join([CENTERS_HEADER, *rows]) + "\n", [".csv"])
-    write_sidecar(path, provenance)
+    write_rows(path, [CENTERS_HEADER], centers.tolist(), provenance)

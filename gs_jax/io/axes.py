@@ -9,6 +9,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+import numpy as np
 import tifffile
 
 from ..base.errors import InputError, input_error
@@ -125,7 +126,7 @@ def _planes(path: Path, pixels: ElementTree.Element, own: str | None, pages: int
     order = [axis for axis in pixels.attrib["DimensionOrder"] if axis in _OME_AXES]
     if sorted(order) != sorted(_OME_AXES):
         raise ValueError(f"order {order}")
-    planes: list[tuple[Path, int] | None] = [None] * count
+    planes = np.full(count, None, object)
     elements = pixels.findall("{*}TiffData") or [ElementTree.Element("TiffData")]
     names = {name for element in elements if (name := _file_name(element))}
     for element in elements:
@@ -143,7 +144,11 @@ def _planes(path: Path, pixels: ElementTree.Element, own: str | None, pages: int
             first, step = first + int(element.get(f"First{axis}", 0)) * step, step * lengths[axis]
         for index in range(first, min(first + number, count)):
             if page + index - first < known:
-                planes[_row_major(index, order, lengths)] = (file, page + index - first)
+                planes[index] = (file, page + index - first)
+    # The declared order has the fastest axis first; ours is t, c, z.
+    slowest_first = order[::-1]
+    planes = planes.reshape([lengths[axis] for axis in slowest_first])
+    planes = planes.transpose([slowest_first.index(axis) for axis in _OME_AXES]).ravel().tolist()
     size = int(pixels.attrib["SizeY"]), int(pixels.attrib["SizeX"])
     return OmePlanes({axis.lower(): n for axis, n in lengths.items()}, size, planes)
 
@@ -153,14 +158,6 @@ def _file_name(element: ElementTree.Element) -> str | None:
     uuid = element.find("{*}UUID")
     name = None if uuid is None else uuid.get("FileName")
     return name and PurePath(name.replace("\\", "/")).name
-
-
-def _row_major(number: int, order: list[str], lengths: dict[str, int]) -> int:
-    """Number of a plane with z as the fastest axis, then c, from that in the declared order, fastest first."""
-    at = {}
-    for axis in order:
-        number, at[axis] = divmod(number, lengths[axis])
-    return (at["T"] * lengths["C"] + at["C"]) * lengths["Z"] + at["Z"]
 
 
 def read_ndtiff(path: Path) -> tuple[list[tuple[str, int]], list[tuple[Path, int] | None]] | None:

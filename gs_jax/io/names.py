@@ -1,11 +1,12 @@
 """Names of files and columns as data: numbers, units of length, gaps in series, and text for any file format."""
 
+import itertools
 import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import PurePath
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from ..base.errors import InputError
 
@@ -13,6 +14,9 @@ Name = TypeVar("Name", bound=str | PurePath)
 
 # A unit after a number. Lengths alone: other units are compared by their letters.
 _UNIT_AFTER = re.compile(r"([nmcuµμ]m)(?![a-z])", re.IGNORECASE)
+# Numbers, with decimals unless they have two points, as versions and dates, and what divides decimals.
+_NUMBER = re.compile(r"((?<![\d.,])\d+(?:[.,]|p(?=\d+[nmcuµμ]m))\d+(?![.,]?\d)|\d+)")
+_POINT = re.compile("[.,p]")
 _SIGNS = {"-": -1, "−": -1, "+": 1}
 # Characters that XML 1.0 cannot hold, and bytes of a name that are not UTF-8, which Python reads as surrogates.
 _NOT_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]")
@@ -54,16 +58,6 @@ def _escaped(code: int) -> str:
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
 
 
-class _Piece(NamedTuple):
-    """The digits of a number, those of its decimals if it may have any, and the text before and after it."""
-
-    is_first: bool
-    before: str
-    whole: str
-    decimals: str
-    after: str
-
-
 def natural_order(names: Iterable[Name]) -> list[Name]:
     """Sort names by the numbers in them: `z2` before `z10`, and `z10.25` before `z10.5`.
 
@@ -72,55 +66,50 @@ def natural_order(names: Iterable[Name]) -> list[Name]:
     decimals, if these decimals end in zeros and are not all of one length (`run1.9`, `run1.10`).
     """
     names = list(names)
-    pieces = [_pieces(str(name)) for name in names]
-    decimals, texts, units = defaultdict(set), set(), set()
-    for piece in (piece for own, *_ in pieces for piece in own):
-        texts.add(piece.before)
-        if piece.decimals:
-            decimals[piece.before].add(piece.decimals)
-        if unit := _UNIT_AFTER.match(piece.after):
-            units.add(unit[1].lower())
+    split = [_split(str(name)) for name in names]
+    triples = [texts[i - 1 : i + 2] for texts, _ in split for i in range(1, len(texts), 2)]
+    decimals = defaultdict(set)
+    for before, number, _ in triples:
+        if not number.isdecimal():
+            decimals[before].add(_POINT.split(number)[1])
+    befores = {before for before, *_ in triples}
     counted = {before for before, digits in decimals.items() if not _are_decimals(digits)}
-    keys = [
+    units = {unit[1].lower() for *_, after in triples if (unit := _UNIT_AFTER.match(after))}
+
+    def key(index: int) -> list:
+        texts, suffix = split[index]
+        numbers = (_key(texts, i, befores, counted, len(units) > 1) for i in range(1, len(texts), 2))
         # Text and numbers alternate, also where a name ends and another goes on.
-        [*(item for piece in own for item in _key(piece, texts, counted, len(units) > 1)), rest, -math.inf, suffix]
-        for own, rest, suffix in pieces
-    ]
-    order = sorted(range(len(names)), key=lambda i: (keys[i], str(names[i])))
-    return [names[i] for i in order]
+        return [*itertools.chain.from_iterable(numbers), texts[-1], -math.inf, suffix, str(names[index])]
+
+    return [names[index] for index in sorted(range(len(names)), key=key)]
 
 
-def _pieces(name: str) -> tuple[list[_Piece], str, str]:
-    """The numbers of a name, the text after the last, and the suffix."""
+def _split(name: str) -> tuple[list[str], str]:
+    """Texts and numbers of a name in turn, and its suffix."""
     suffix = PurePath(name).suffix
     suffix = "" if suffix[1:].isdigit() else suffix
-    stem = name.removesuffix(suffix)
-    # Numbers with two points are versions or dates.
-    numbers = list(re.finditer(r"(?<![\d.,])(\d+)(?:[.,]|p(?=\d+[nmcuµμ]m))(\d+)(?![.,]?\d)|(\d+)", stem))
-    pieces, end = [], 0
-    ends = [*(match.start() for match in numbers[1:]), len(stem)]
-    for match, following in zip(numbers, ends, strict=False):
-        whole, decimals = match[1] or match[3], match[2] or ""
-        pieces.append(_Piece(not pieces, stem[end : match.start()], whole, decimals, stem[match.end() : following]))
-        end = match.end()
-    return pieces, stem[end:], suffix
+    return _NUMBER.split(name.removesuffix(suffix)), suffix
 
 
 def _are_decimals(digits: set[str]) -> bool:
     return len(set(map(len, digits))) == 1 or not any(text.endswith("0") and text != "0" for text in digits)
 
 
-def _key(piece: _Piece, texts: set[str], counted: set[str], has_units: bool) -> list:
-    before, sign = piece.before, 1
+def _key(texts: list[str], index: int, befores: set[str], counted: set[str], has_units: bool) -> list:
+    """What the number `texts[index]` is compared by, after the text before it."""
+    before, number, after = texts[index - 1 : index + 2]
+    text, sign = before, 1
     # A hyphen alone stands between two numbers, as in dates, or begins the name.
-    can_be = before[-1:] in _SIGNS if before[:-1] else piece.is_first and before in _SIGNS
-    if can_be and (not before[-2:-1].isalnum() or before[:-1] in texts):
-        before, sign = before[:-1], _SIGNS[before[-1]]
-    unit = _UNIT_AFTER.match(piece.after) if has_units else None
+    can_be = before[-1:] in _SIGNS if before[:-1] else index == 1 and before in _SIGNS
+    if can_be and (not before[-2:-1].isalnum() or before[:-1] in befores):
+        text, sign = before[:-1], _SIGNS[before[-1]]
+    unit = _UNIT_AFTER.match(after) if has_units else None
     scale = sign * (mm_per(unit[1].lower()) if unit else 1)
-    if piece.decimals and piece.before in counted:
-        return [before, scale * int(piece.whole), ".", int(piece.decimals)]
-    return [before, scale * (float(f"{piece.whole}.{piece.decimals}") if piece.decimals else int(piece.whole))]
+    whole, *decimals = _POINT.split(number)
+    if decimals and before in counted:
+        return [text, scale * int(whole), ".", int(decimals[0])]
+    return [text, scale * (float(f"{whole}.{decimals[0]}") if decimals else int(whole))]
 
 
 def first_gap(names: Sequence[str]) -> tuple[str, str] | None:

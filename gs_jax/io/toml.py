@@ -59,7 +59,7 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
             lines.append(f"`{_dotted(place)}`: no such key; {_nearest(place, model, _keys(model, also))}")
         else:
             given = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
-            lines.append(f"`{_dotted(place)}` must be {_allowed(place, model)}, got {given}")
+            lines.append(f"`{_dotted(place)}` must be {_walk(place, model)[1]}, got {given}")
     more = len(problems) - len(lines)
     return "; ".join([*lines, f"and {more} more problems"] if more else lines)
 
@@ -76,23 +76,14 @@ def table_of(annotation: Any) -> type[BaseModel] | None:
     return next((table for part in get_args(annotation) if (table := table_of(part))), None)
 
 
-def _allowed(place: Place, model: type[BaseModel]) -> str:
-    """Return the description of the field at `place`, or of the one that it is an element of."""
+def _walk(place: Place, model: type[BaseModel]) -> tuple[type[BaseModel], str]:
+    """The innermost table at a place, and the description of the field there, or of the list that it is in."""
     description = ""
     for step in place:
-        field = model.model_fields.get(str(step))
-        if field is None:  # an index of a list, or a name
-            continue
-        description = field.description or description
-        model = table_of(field.annotation) or model
-    return description
-
-
-def _innermost(tables: Sequence[str], model: type[BaseModel]) -> type[BaseModel]:
-    for name in tables:
-        if field := model.model_fields.get(name):
+        if field := model.model_fields.get(str(step)):  # none for an index of a list, or a name
+            description = field.description or description
             model = table_of(field.annotation) or model
-    return model
+    return model, description
 
 
 def _keys(model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -107,7 +98,7 @@ def _keys(model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> dict[str
 def _nearest(place: Place, model: type[BaseModel], keys: Mapping[str, Sequence[str]]) -> str:
     """Suggest the same key of another table, a similar key, or else every key of this table."""
     *tables, wrong = (str(step) for step in place)
-    here = keys.get(".".join(tables)) or list(_innermost(tables, model).model_fields)
+    here = keys.get(".".join(tables)) or list(_walk(tuple(tables), model)[0].model_fields)
     everywhere = {}
     for table, names in keys.items():
         for key in names:

@@ -114,12 +114,11 @@ def simulate(
             return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
         return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
 
-    each, _ = split_groups(imager)
-    if len(each) == 1:
+    groups, _ = split_groups(imager)
+    if len(groups) == 1:
         return image_of(imager)
-    light = np.ones(len(each)) if optics == "full" else relative_areas(each)
-    images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
-    return np.sum(images, 0)
+    shares = np.ones(len(groups)) if optics == "full" else relative_areas(groups)
+    return np.sum([image_of(group) * np.float32(share) for group, share in zip(groups, shares, strict=True)], 0)
 
 
 def _check_shape(shape: tuple[int, ...], grid: Grid | None) -> None:
@@ -161,8 +160,8 @@ def simulate_volume(
         if not plane.any():
             continue
         fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
-        one = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
-        image += forward(fine[None], imager, one, of_depth(depth))
+        fine_grid = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
+        image += forward(fine[None], imager, fine_grid, of_depth(depth))
     return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
 
 
@@ -197,9 +196,9 @@ def simulate_points(
     between = np.clip(np.searchsorted(depths, points[:, 2], "right") - 1, 0, max(depths.size - 2, 0))
     slabs, image, progress = between // _SLAB, 0, progress or Progress()
     for slab in np.unique(slabs):
-        some = depths[slab * _SLAB :][: _SLAB + 1]
-        fine = np.stack([kernel(depth) for depth in progress.track(some, "Point spread functions")])
-        image = image + forward_points(points[slabs == slab], imager, make_stamps(some, fine), progress)
+        own = depths[slab * _SLAB :][: _SLAB + 1]
+        fine = np.stack([kernel(depth) for depth in progress.track(own, "Point spread functions")])
+        image = image + forward_points(points[slabs == slab], imager, make_stamps(own, fine), progress)
     return np.asarray(image)
 
 
