@@ -209,79 +209,58 @@ TEXTS = {
     "empty": (b"", ["`name`", "`sensor`", "more problems"]),
     "tables": (b"[[sensor]]\nshape = [3, 4]\n", ["`sensor`", "a table"]),
 }
-
-
-@pytest.mark.parametrize(("text", "words"), TEXTS.values(), ids=TEXTS)
-def test_wrong_text(tmp_path, text, words):
-    path = tmp_path / "design.toml"
-    path.write_bytes(text)
-    message_of(path, *words)
-
-
 CENTERS = {
-    "empty": (b"", ["header", "x_mm,y_mm"]),
+    "no bytes": (b"", ["c.csv", "header", "x_mm,y_mm"]),
     "header only": (b"x_mm,y_mm\n", ["`array.centers_mm`", "[]"]),
-    "ragged": (b"x_mm,y_mm\n1,2\n3\n", ["line 3", "got 1 values"]),
-    "wide": (b"x_mm,y_mm\n1,2,3\n", ["line 2", "got 3 values"]),
-    "word": (b"x_mm,y_mm\n1,two\n", ["line 2", "y_mm", "'two'", "finite number"]),
-    "nan": (b"x_mm,y_mm\nnan,2\n", ["line 2", "x_mm", "'nan'", "finite number"]),
-    "underscore": (b"x_mm,y_mm\n1_0,2\n", ["line 2", "x_mm", "'1_0'"]),
-    "latin": (b"x_mm,y_mm\n\xe9,2\n", ["UTF-8"]),
-    "wide character": ("x_mm,y_mm\n1,2\n".encode("utf-16"), ["UTF-8"]),
-    "field": (b"x_mm,y_mm\n" + b"1" * 200_000, ["line", "field limit"]),
-    "rows": (b"x_mm,y_mm\n" + b"1,2\n" * 100_001, ["more than 100000 rows"]),
+    "ragged": (b"x_mm,y_mm\n1,2\n3\n", ["c.csv", "line 3", "got 1 values"]),
+    "wide": (b"x_mm,y_mm\n1,2,3\n", ["c.csv", "line 2", "got 3 values"]),
+    "word": (b"x_mm,y_mm\n1,two\n", ["c.csv", "line 2", "y_mm", "'two'", "finite number"]),
+    "nan": (b"x_mm,y_mm\nnan,2\n", ["c.csv", "line 2", "x_mm", "'nan'", "finite number"]),
+    "underscore": (b"x_mm,y_mm\n1_0,2\n", ["c.csv", "line 2", "x_mm", "'1_0'"]),
+    "one byte": (b"x_mm,y_mm\n\xe9,2\n", ["c.csv", "UTF-8"]),
+    "wide character": ("x_mm,y_mm\n1,2\n".encode("utf-16"), ["c.csv", "UTF-8"]),
+    "field": (b"x_mm,y_mm\n" + b"1" * 200_000, ["c.csv", "line", "field limit"]),
+    "rows": (b"x_mm,y_mm\n" + b"1,2\n" * 100_001, ["c.csv", "more than 100000 rows"]),
+    # Quickly, too.
+    "coincident": (b"x_mm,y_mm\n" + b"0.5,0.5\n" * 100_000, ["`array.centers_mm`", "0.001 mm"]),
     "outside": (b"x_mm,y_mm\n0,0\n9,9\n", ["lens 2", "plate"]),
     "micrometres": (b"0,0\n-1000,500\n", ["lens 2", "plate", 'micrometres (`centers_unit = "um"`)?']),
     "corner": (b"0.1,0.1\n2.9,3.9\n", ["lens 2", "plate", '`centers_origin = "corner"`']),
     "both": (b"100,100\n2900,3900\n", ["lens 1", 'from a corner (`centers_unit = "um"`']),
-    "three columns": (b"1,2,3\n", ["3 columns without a header", "`centers_columns`"]),
-    "names": (b"n,a,b\n1,2,3\n", ["3 columns: 'n', 'a', 'b'", "`centers_columns`"]),
-    "twice": (b"x,x,y\n1,2,3\n", ["3 columns: 'x', 'x', 'y'"]),
-    "half a header": (b"1.0,n/a\n1,2\n", ["'1.0,n/a'", "names, or numbers"]),
-    "no numbers": (b"# made by hand\n\n", ["no line", "header"]),
-    "decimals": (b"x;y\n1,5;1.000,5\n", ["line 2", "'1.000,5'"]),
+    "three columns": (b"1,2,3\n", ["c.csv", "3 columns without a header", "`centers_columns`"]),
+    "names": (b"n,a,b\n1,2,3\n", ["c.csv", "3 columns: 'n', 'a', 'b'", "`centers_columns`"]),
+    "twice": (b"x,x,y\n1,2,3\n", ["c.csv", "3 columns: 'x', 'x', 'y'"]),
+    "half a header": (b"1.0,n/a\n1,2\n", ["c.csv", "'1.0,n/a'", "names, or numbers"]),
+    "no numbers": (b"# made by hand\n\n", ["c.csv", "no line", "header"]),
+    "decimals": (b"x;y\n1,5;1.000,5\n", ["c.csv", "line 2", "'1.000,5'"]),
 }
 
 
-@pytest.mark.parametrize(("text", "words"), CENTERS.values(), ids=CENTERS)
-def test_wrong_centers_file(tmp_path, text, words):
-    (tmp_path / "c.csv").write_bytes(text)
+@pytest.mark.parametrize("name", [*TEXTS, *CENTERS])
+def test_wrong_text(tmp_path, name):
     path = written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"})
-    message = message_of(path, *words)
-    assert "c.csv" in message or "`array.centers_mm`" in message
+    text, words = (TEXTS | CENTERS)[name]
+    (path if name in TEXTS else tmp_path / "c.csv").write_bytes(text)
+    message_of(path, *words)
 
 
-def test_wrong_path(tmp_path):
+def test_wrong_path(tmp_path, monkeypatch):
     message_of(tmp_path / "none.toml", "No such file")
     (tmp_path / "folder.toml").mkdir()
     message_of(tmp_path / "folder.toml", "a folder")
     os.mkfifo(tmp_path / "pipe.toml")
     message_of(tmp_path / "pipe.toml", "must be a file, got a device or a pipe")
     assert "null" in str(pytest.raises(InputError, read_design, "a\0b").value)
-
-
-def test_unreadable(tmp_path, monkeypatch):
-    path = written(tmp_path)
+    with (tmp_path / "large.toml").open("wb") as file:
+        file.truncate(2**26 + 1)
+    message_of(tmp_path / "large.toml", str(2**26))
 
     def denied(*args, **kwargs):
         raise PermissionError(13, "Permission denied")
 
+    path = written(tmp_path)
     monkeypatch.setattr("builtins.open", denied)  # the tests may run as root, whom no mode stops
-    with pytest.raises(InputError, match="design.toml.*Permission denied"):
-        read_design(path)
-
-
-def test_too_large(tmp_path):
-    path = tmp_path / "large.toml"
-    with path.open("wb") as file:
-        file.truncate(2**26 + 1)
-    message_of(path, str(2**26))
-
-
-def test_many_coincident_lenses_are_refused_quickly(tmp_path):
-    (tmp_path / "c.csv").write_text("x_mm,y_mm\n" + "0.5,0.5\n" * 100_000)
-    path = written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"})
-    message_of(path, "0.001 mm")
+    message_of(path, "Permission denied")
 
 
 def test_problems_are_joined_in_one_line(tmp_path):
@@ -326,22 +305,32 @@ def test_least_is_enough_and_integers_are_numbers(tmp_path):
 
 
 def test_the_authors_array():
-    path = needs("oracle/dev/P1.toml")
-    design = read_design(path)
+    design = read_design(needs("oracle/dev/P1.toml"))
     assert len(design.array.centers_mm) == 213 and design.array.centers_mm[1] == (-9.34, -7.77)
     assert design.imager().sensor.shape == (5120, 5120)
 
 
-def test_centers_file_is_relative_and_is_written_inline(tmp_path, monkeypatch):
+def test_what_is_written(tmp_path, monkeypatch):
+    """As the contract has it; a file of centres, relative to the design, is written inline."""
     (tmp_path / "sub").mkdir()
     (tmp_path / "c.csv").write_bytes(b"\xef\xbb\xbfx_mm,y_mm\r\n0.1,-0.2\r\n\r\n1e-1,1.5\r\n")
-    path = written(tmp_path / "sub", {"array.centers_mm": MISSING, "array.centers_file": "../c.csv"})
+    strings = {"a": "[\n    1,\n    2,\n]", "b": ["x,y", "[1, 2]"], "c": [["a", 1], [1, 2], [[1, 2], 3]], "d": [1]}
+    provenance = strings | {"made": datetime.date(2026, 1, 1)}
+    file = {"array.centers_mm": MISSING, "array.centers_file": "../c.csv"}
+    path = written(tmp_path / "sub", file | {"provenance": provenance})
     monkeypatch.chdir(tmp_path)
     design = read_design(Path("sub/design.toml"))
-    assert design.array.centers_mm == ((0.1, -0.2), (0.1, 1.5))
+    assert design.array.centers_mm == ((0.1, -0.2), (0.1, 1.5)) and design.provenance == provenance
     write_design(path, design)
-    assert "centers_file" not in path.read_text() and "    [0.1, -0.2],\n" in path.read_text()
-    assert read_design(path) == design
+    text = path.read_text()
+    assert "    [0.1, -0.2],\n" in text and "shape = [400, 300]\n" in text
+    assert "working_distance_mm = [18.0, 30.0]\n" in text
+    changes = {"provenance": provenance, "array.centers_mm": [[0.1, -0.2], [0.1, 1.5]]}
+    assert tomllib.loads(text) == edited(changes) and read_design(path) == design
+    for wrong, words in ((tmp_path / "a.json", ".toml"), (tmp_path / "none" / "a.toml", "there is no folder")):
+        with pytest.raises(InputError, match=re.escape(words)):
+            write_design(wrong, design)
+    assert sorted(os.listdir(tmp_path)) == ["c.csv", "sub"]
 
 
 VALUES = st.recursive(
@@ -369,22 +358,30 @@ def test_round_trip(tmp_path, name, radius, shift, x, provenance):
     assert os.listdir(tmp_path) == ["a.toml"]
 
 
-def test_strings_that_look_like_arrays_survive(tmp_path):
-    provenance = {"a": "[\n    1,\n    2,\n]", "b": ["x,y", "[1, 2]"], "c": [["a", 1], [1, 2], [[1, 2], 3]], "d": [1]}
-    design = Design.model_validate(edited({"provenance": provenance}))
-    write_design(tmp_path / "a.toml", design)
-    assert read_design(tmp_path / "a.toml").provenance == provenance
+@settings(max_examples=examples(300), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_text_is_read_or_refused(tmp_path, data):
+    """Random bytes; bytes of a valid file changed, cut out or doubled; a value replaced by any other."""
 
+    def mutated(text):
+        text = bytearray(text)
+        for _ in range(data.draw(st.integers(1, 3))):
+            at = data.draw(st.integers(0, len(text) - 1))
+            text[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+        return text
 
-def test_write_refuses_before_writing(tmp_path):
-    design = Design.model_validate(BASE)
-    for path, words in ((tmp_path / "a.json", ".toml"), (tmp_path / "none" / "a.toml", "there is no folder")):
-        with pytest.raises(InputError, match=re.escape(words)):
-            write_design(path, design)
-    assert os.listdir(tmp_path) == []
-
-
-def parses_or_refuses(path):
+    path, kind = written(tmp_path), data.draw(st.sampled_from(["random", "design", "centers", "value"]))
+    if kind == "random":
+        texts = st.text(max_size=200).map(lambda text: text.encode("utf-8", "surrogatepass"))
+        path.write_bytes(data.draw(st.binary(max_size=200) | texts))
+    elif kind == "design":
+        path.write_bytes(mutated(tomli_w.dumps(BASE | {"calibration": {"shift_mm": [0.1, 0.1]}}).encode()))
+    elif kind == "centers":
+        (tmp_path / "c.csv").write_bytes(mutated(b"x_mm,y_mm\n-1.0,0.5\n0.25,1.0\n"))
+        path = written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"})
+    else:
+        keys = [f"{table}.{key}" for table in BASE if table != "name" for key in BASE[table]]
+        path.write_text(tomli_w.dumps(edited({data.draw(st.sampled_from(keys)): data.draw(VALUES)})))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)
@@ -393,54 +390,6 @@ def parses_or_refuses(path):
         assert str(error).isprintable() and path.name in str(error)
     else:
         assert isinstance(design, Design) and design.imager().centers.shape[1] == 2
-
-
-FUZZ = settings(max_examples=examples(150), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@FUZZ
-@given(text=st.binary(max_size=200) | st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass")))
-def test_random_bytes(tmp_path, text):
-    path = tmp_path / "a.toml"
-    path.write_bytes(text)
-    parses_or_refuses(path)
-
-
-@FUZZ
-@given(data=st.data())
-def test_mutated_design(tmp_path, data):
-    """Bytes of a valid file changed, cut out or doubled, or a value replaced by any other."""
-    path = tmp_path / "a.toml"
-    if data.draw(st.booleans()):
-        text = bytearray(tomli_w.dumps(BASE | {"calibration": {"shift_mm": [0.1, 0.1]}}).encode())
-        for _ in range(data.draw(st.integers(1, 3))):
-            at = data.draw(st.integers(0, len(text) - 1))
-            text[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
-        path.write_bytes(text)
-    else:
-        keys = [f"{table}.{key}" for table in BASE if table != "name" for key in BASE[table]]
-        path.write_text(tomli_w.dumps(edited({data.draw(st.sampled_from(keys)): data.draw(VALUES)})))
-    parses_or_refuses(path)
-
-
-@FUZZ
-@given(data=st.data())
-def test_mutated_centers(tmp_path, data):
-    text = bytearray(b"x_mm,y_mm\n-1.0,0.5\n0.25,1.0\n")
-    for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(0, len(text) - 1))
-        text[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
-    (tmp_path / "c.csv").write_bytes(text)
-    parses_or_refuses(written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"}))
-
-
-def test_the_written_file_is_the_contracts(tmp_path):
-    write_design(
-        tmp_path / "a.toml", Design.model_validate(edited({"provenance": {"made": datetime.date(2026, 1, 1)}}))
-    )
-    text = (tmp_path / "a.toml").read_text()
-    assert "shape = [400, 300]\n" in text and "working_distance_mm = [18.0, 30.0]\n" in text
-    assert tomllib.loads(text) == edited({"provenance": {"made": datetime.date(2026, 1, 1)}})
 
 
 RADII = [2.0, 1.9, 2.0]
@@ -480,29 +429,29 @@ def test_the_shape_of_a_lens_goes_to_the_imager_and_back(tmp_path):
     assert "k = -0.7, 2 aspheric terms, curved side to the object" in repr(found)
 
 
+EVERYTHING = {
+    "lens.radius_of_curvature_mm": [2.0, 2.1, 2.0],
+    "lens.conic_constant": -0.6,
+    "lens.orientation": "curved",
+    "sensor.origin_mm": [0.13, -0.07],
+    "sensor.pixel_pitch_um": 3.45,
+    "imaging.wavelength_nm": 532.1,
+    "calibration": {"rotation_deg": 31.4, "shift_mm": [0.1, -0.2], "tilt_deg": [0.9, -0.7]},
+}
+
+
 @pytest.mark.parametrize("x64", [False, True])
-@pytest.mark.parametrize("path", DESIGNS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*DESIGNS, None], ids=lambda path: path.stem if path else "everything")
 def test_a_design_is_its_imagers(path, x64):
-    with jax.enable_x64(x64):
-        design = read_design(path).model_copy(update={"provenance": {}})
+    with jax.enable_x64(x64 or path is None):
+        design = read_design(path) if path else Design.model_validate(edited(EVERYTHING))
+        design = design.model_copy(update={"provenance": {}})
         imager, depths = design.imager(), design.imaging.working_distance_mm
         found = Design.from_imager(imager, name=design.name, working_distance_mm=depths)
         assert found == design
         (leaves, tree), (expected, structure) = map(jax.tree.flatten, (found.imager(), imager))
         assert tree == structure and [leaf.dtype for leaf in leaves] == [leaf.dtype for leaf in expected]
         assert all(np.array_equal(a, b) for a, b in zip(leaves, expected, strict=True))
-
-
-def test_a_design_of_everything_is_its_imagers():
-    given = {
-        "lens": BASE["lens"]
-        | {"radius_of_curvature_mm": [2.0, 2.1, 2.0], "conic_constant": -0.6, "orientation": "curved"},
-        "sensor": BASE["sensor"] | {"origin_mm": [0.13, -0.07], "pixel_pitch_um": 3.45},
-        "imaging": BASE["imaging"] | {"wavelength_nm": 532.1},
-        "calibration": {"rotation_deg": 31.4, "shift_mm": [0.1, -0.2], "tilt_deg": [0.9, -0.7]},
-    }
-    design = Design.model_validate(BASE | given)
-    assert Design.from_imager(design.imager(), name="small", working_distance_mm=(18.0, 30.0)) == design
 
 
 def test_a_design_of_an_imager_says_what_is_sharp():
