@@ -92,74 +92,59 @@ def test_what_a_calibration_finds_of_a_sample_goes_where_it_is_from(lab):
     assert (new.sample, gel.refractive_index, gel.surface_mm) == (design.sample, 1.44, 19.5)
 
 
-SIMULATE, METRICS = ("simulate", "points.csv", "lab.toml"), ("metrics", "lab.toml")
-RECONSTRUCT = ("reconstruct", "capture.npy", "lab.toml", "--depths", "18:22:1")
+SIMULATE, METRICS = "simulate points.csv lab.toml -o a.tif", "metrics lab.toml"
+RECONSTRUCT = "reconstruct capture.npy lab.toml --depths 18:22:1 -o v.tif"
+CALIBRATE = "calibrate lab.toml capture.npy --from-scene -o new.toml"
 WRONG = [
-    ((*METRICS, "--sample", "jelly"), "`sample` must be one of [samples] in the design, gel, air, got 'jelly'"),
-    ((*METRICS, "--sample-index", "1.4"), "--sample-index must be used with --sample-at"),
-    ((*METRICS, "--sample-at", "19"), "--sample-at must be used with --sample-index"),
-    ((*METRICS, "--sample", "gel", "--sample-index", "1.4", "--sample-at", "19"), "--sample must be used without"),
-    ((*METRICS, "--wavelength-nm", "0.52"), "must be 10 to 100000 nm, got '0.52'"),
-    ((*METRICS, "--sample", "gel", "--depths", "18"), "--depths must be 19 mm or more, where layers end"),
-    ((*METRICS, "--sample-index", "1.4", "--sample-at", "1"), "`sample.surface_mm` must be 2 mm or more"),
+    (f"{METRICS} --sample jelly", "`sample` must be one of [samples] in the design, gel, air, got 'jelly'"),
+    (f"{METRICS} --sample-index 1.4", "--sample-index must be used with --sample-at"),
+    (f"{METRICS} --sample-at 19", "--sample-at must be used with --sample-index"),
+    (f"{METRICS} --sample gel --sample-index 1.4 --sample-at 19", "--sample must be used without"),
+    (f"{METRICS} --wavelength-nm 0.52", "must be 10 to 100000 nm, got '0.52'"),
+    (f"{METRICS} --sample gel --depths 18", "--depths must be 19 mm or more, where layers end"),
+    (f"{METRICS} --sample-index 1.4 --sample-at 1", "`sample.surface_mm` must be 2 mm or more"),
+    (f"{SIMULATE} --sample-index 1.4 --sample-at 1", "`surface` must be 2 mm, as"),
+    (f"{SIMULATE} --sample none --depths-from sample", "--depths-from sample must be used with a sample, got air"),
+    ("simulate in-gel.csv lab.toml --sample gel -o a.tif", "depths must be 19 mm or more"),
     (
-        (*SIMULATE, "--sample-index", "1.4", "--sample-at", "1", "-o", "a.tif"),
-        "`surface` must be 2 mm, as",
+        "simulate from-array.csv lab.toml --sample gel --depths-from sample -o a.tif",
+        "--depths-from must be array, as SCENE says",
     ),
-    (
-        (*SIMULATE, "--sample", "none", "--depths-from", "sample", "-o", "a.tif"),
-        "--depths-from sample must be used with a sample, got air",
+    (f"{RECONSTRUCT} --sample gel", "--depths must be 19 mm or more, where layers end"),
+    (f"{RECONSTRUCT} --depths-from plate", "is not one of 'array', 'sample'"),
+    ("tolerance lab.toml --sample gel --depths 18", "depths must be 19 mm or more"),
+    ("report lab.toml --sample jelly -o a.html", "`sample` must be one of"),
+    ("explore lab.toml --sample jelly", "`sample` must be one of"),
+    # A sample is asked for where none is the default.
+    *(
+        (command, "`sample` must be given (--sample NAME, or sample in a study): the design has no default [sample]")
+        for command in (METRICS, SIMULATE, RECONSTRUCT, "tolerance lab.toml", "report lab.toml -o a.html",
+                        "explore lab.toml", CALIBRATE)
     ),
-    (("simulate", "in-gel.csv", "lab.toml", "--sample", "gel", "-o", "a.tif"), "depths must be 19 mm or more"),
-    ((*RECONSTRUCT, "--sample", "gel", "-o", "v.tif"), "--depths must be 19 mm or more, where layers end"),
-    ((*RECONSTRUCT, "--depths-from", "plate", "-o", "v.tif"), "is not one of 'array', 'sample'"),
-    (("tolerance", "lab.toml", "--sample", "gel", "--depths", "18"), "depths must be 19 mm or more"),
-    (("report", "lab.toml", "--sample", "jelly", "-o", "a.html"), "`sample` must be one of"),
-    (("explore", "lab.toml", "--sample", "jelly"), "`sample` must be one of"),
-]
+]  # fmt: skip
 
 
-ASKED = [
-    METRICS,
-    (*SIMULATE, "-o", "a.tif"),
-    (*RECONSTRUCT, "-o", "v.tif"),
-    ("tolerance", "lab.toml"),
-    ("report", "lab.toml", "-o", "a.html"),
-    ("explore", "lab.toml"),
-    ("calibrate", "lab.toml", "capture.npy", "--from-scene", "-o", "new.toml"),
-]
-
-
-@pytest.mark.parametrize("arguments", ASKED, ids=[arguments[0] for arguments in ASKED])
-def test_a_sample_is_asked_for_where_none_is_the_default(lab, monkeypatch, capsys, arguments):
+@pytest.mark.parametrize(("arguments", "words"), WRONG)
+def test_what_does_not_go_together(lab, monkeypatch, capsys, arguments, words):
     np.save("capture.npy", np.ones((640, 640), np.uint16))
+    gs.write_points("from-array.csv", TRUTH, provenance={"depths_from": "array"})
     before = sorted(lab.iterdir())
-    status, _, err = run(monkeypatch, capsys, *arguments)
-    assert status == 2 and err.count("\n") == 1 and sorted(lab.iterdir()) == before
-    assert (
-        "`sample` must be given (--sample NAME, or sample in a study): the design has no default [sample], but " in err
-    )
+    status, _, err = run(monkeypatch, capsys, *arguments.split())
+    assert status == 2 and words in err and err.count("\n") == 1 and sorted(lab.iterdir()) == before, err
 
 
-RECONSTRUCTED = ("reconstruct", "capture.npy", "lab.toml", "--depths", "20", "--voxel-um", 200, "-o", "v.tif")
-REPORTED = pytest.param(("report", "lab.toml", "-o", "a.html"), marks=pytest.mark.integration)
+RECONSTRUCTED = "reconstruct capture.npy lab.toml --depths 20 --voxel-um 200 -o v.tif"
+REPORTED = pytest.param("report lab.toml -o a.html", marks=pytest.mark.integration)
 
 
-@pytest.mark.parametrize("command", [METRICS, RECONSTRUCTED, REPORTED], ids=lambda command: command[0])
+@pytest.mark.parametrize("command", [METRICS, RECONSTRUCTED, REPORTED], ids=lambda command: command.split()[0])
 @pytest.mark.parametrize("name", ["gel", pytest.param("none", marks=pytest.mark.integration)])
 def test_commands_say_which_medium_they_take(lab, monkeypatch, capsys, command, name):
     np.save("capture.npy", np.ones((640, 640), np.uint16))
     gel = "n = 1.43 from z = 19 mm, behind 2 mm of n = 1.52 and 0.17 mm of n = 1.523"
     medium = {"gel": gel, "none": "air, behind 2 mm of n = 1.52"}[name]
-    status, out, err = run(monkeypatch, capsys, *command, "--sample", name)
+    status, out, err = run(monkeypatch, capsys, *command.split(), "--sample", name)
     assert status == 0 and f"objects in {medium}" in out, err
-
-
-@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[words for _, words in WRONG])
-def test_what_does_not_go_together(lab, monkeypatch, capsys, arguments, words):
-    np.save("capture.npy", np.ones((640, 640), np.uint16))
-    status, _, err = run(monkeypatch, capsys, *arguments)
-    assert status == 2 and words in err and err.count("\n") == 1, err
 
 
 @pytest.mark.parametrize("name", ["v.ome.tif", "v.zarr"])
@@ -170,15 +155,8 @@ def test_a_volume_from_the_surface_on_is_read_back(tmp_path, name):
     assert gs.read_volume(tmp_path / name)[1].depths.tolist() == pytest.approx([19.0, 19.4, 19.8])
 
 
-def test_a_file_that_says_array_is_not_taken_for_another(lab, monkeypatch, capsys):
-    gs.write_points("points.csv", TRUTH, provenance={"depths_from": "array"})
-    how = ("--sample", "gel", "--depths-from", "sample", "-o", "a.tif")
-    status, _, err = run(monkeypatch, capsys, *SIMULATE, *how)
-    assert status == 2 and "--depths-from must be array, as SCENE says" in err
-
-
 def test_metrics_show_the_path_of_the_light(lab, monkeypatch, capsys):
-    status, out, err = run(monkeypatch, capsys, *METRICS, "--sample", "gel", "--json", "m.json")
+    status, out, err = run(monkeypatch, capsys, *METRICS.split(), "--sample", "gel", "--json", "m.json")
     sheet = json.loads((lab / "m.json").read_text())
     assert status == 0 and "2 mm of layers before the array are 1.316 mm of air" in out, err
     assert (sheet["sample_index"], sheet["sample_surface_mm"], sheet["depth_mm"][0]) == (1.43, 19, 19)
