@@ -16,7 +16,7 @@ from ..lenses import lenses_by_type
 from ..materials import EmissionBand, index_of
 from ..optics import theory
 from ..optics.apertures import clear_diameter
-from .tables import ImagingTable, LayersTable, LayerTable, LensTable, SampleTable
+from .tables import ImagingTable, LayerTable, SampleTable
 
 # The names of no sample, and the table of none.
 AIR, NO_SAMPLE = "air", SampleTable(refractive_index=1.0)
@@ -38,13 +38,6 @@ def sample_of(table: SampleTable, wavelength_nm: float) -> Sample | None:
         return None
     # In files layers go outward, as those on the array; a `Sample` has them from the medium.
     return Sample(index, table.surface_mm, layers_of(table.layers[::-1], wavelength_nm))
-
-
-def chosen_sample(design, sample: str | Sample | None, wavelength_nm: float) -> Sample | None:
-    """The sample of a name, or the default one (None); "air" is none."""
-    if isinstance(sample, Sample):
-        return sample
-    return sample_of(sample_table(design, sample), wavelength_nm)
 
 
 def default_sample(design) -> SampleTable:
@@ -81,11 +74,6 @@ def medium_in_words(imager: Imager) -> str:
     return f"{medium}, behind {' and '.join(layers)}" if layers else medium
 
 
-def plate_index(design) -> float:
-    """Index of lenses and plate at the design's wavelength."""
-    return index_of(design.lens.refractive_index, design.imaging.wavelength_nm)
-
-
 def reduced_depth(design, depth: float, index: float | None = None) -> float:
     """Reduced depth `z'` in the default sample, mm, of lenses of the design's index or another."""
     wavelength = design.imaging.wavelength_nm
@@ -108,7 +96,7 @@ def object_begins(design) -> float:
     return float(f"{float(begins):.9g}")
 
 
-def path_in_words(design) -> list[str]:
+def format_path(design) -> list[str]:
     """Layers and sample, a line each."""
     index = lambda table: str(table.refractive_index)
     sides = (("in front", design.layers.object), ("on the sensor", design.layers.sensor))
@@ -128,7 +116,7 @@ def path_in_words(design) -> list[str]:
 def check_path(design) -> None:
     """Raise `ValueError` unless the layers and samples have room, and their materials are known at the wavelength."""
     wavelength = design.imaging.wavelength_nm
-    for key, material in _materials(design):
+    for key, material in _materials(design).items():
         try:
             index = index_of(material, wavelength)
         except InputError as error:
@@ -165,30 +153,26 @@ def _total(layers: Sequence[LayerTable]) -> float:
 
 
 def _plate(design, index: float | None) -> float:
-    return design.array.substrate_thickness_mm / (plate_index(design) if index is None else index)
+    return design.array.substrate_thickness_mm / (design.refractive_index if index is None else index)
 
 
-def _materials(design) -> list[tuple[str, Any]]:
+def _materials(design) -> dict[str, Any]:
     """All indices by their keys."""
-    layers = {"layers.object": design.layers.object, "layers.sensor": design.layers.sensor}
-    found: list[tuple[str, Any]] = [("lens.refractive_index", design.lens.refractive_index)]
-    samples = {"sample": default_sample(design)} | {f"samples.{name}": table for name, table in design.samples.items()}
-    for key, table in samples.items():
-        found.append((f"{key}.refractive_index", table.refractive_index))
-        layers[f"{key}.layers"] = table.layers
-    for key, tables in layers.items():
-        found += [(f"{key}[{i}].refractive_index", layer.refractive_index) for i, layer in enumerate(tables)]
-    return found
+    tables = {"sample": default_sample(design)} | {f"samples.{name}": table for name, table in design.samples.items()}
+    lists = {"layers.object": design.layers.object, "layers.sensor": design.layers.sensor}
+    lists |= {f"{key}.layers": table.layers for key, table in tables.items()}
+    layers = {f"{key}[{i}]": layer for key, layers in lists.items() for i, layer in enumerate(layers)}
+    tables = {"lens": design.lens} | tables | layers
+    return {f"{key}.refractive_index": table.refractive_index for key, table in tables.items()}
 
 
 # Wavelengths of an even band, by Gauss and Legendre, and of a spectrum.
 _EVEN, _PARTS = 3, 5
 
 
-def emission_band(
-    imaging: ImagingTable, lens: LensTable, layers: LayersTable, sample: SampleTable | Sample
-) -> EmissionBand | None:
-    """The band of a design's tables, None for light of one wavelength. A `Sample` has no dispersion."""
+def emission_band(design, sample: SampleTable | Sample) -> EmissionBand | None:
+    """The band of a design and a sample, None for light of one wavelength. A `Sample` has no dispersion."""
+    imaging, layers = design.imaging, design.layers
     if not imaging.bandwidth_nm and not imaging.spectrum_nm:
         return None
     wavelengths, weights = _lines(imaging)
@@ -204,7 +188,7 @@ def emission_band(
     return EmissionBand(
         weights,
         wavelengths / 1e6,
-        lens=shifts(lens.refractive_index),
+        lens=shifts(design.lens.refractive_index),
         filters=of_layers(layers.object),
         windows=of_layers(layers.sensor),
         sample=None if table is None else shifts(table.refractive_index),

@@ -21,11 +21,10 @@ from ..lenses import MicrolensArray
 from ..materials import index_of
 from ..typing import PathLike
 from .conversion import (
-    chosen_sample,
     emission_band,
+    format_path,
     layers_of,
-    path_in_words,
-    plate_index,
+    sample_of,
     sample_table,
     sharp_depths,
     tables_of,
@@ -104,7 +103,7 @@ class Design(Table):
                 f"at v = {imaging.sensor_distance_mm:g} mm",
                 f"  objects at z = {imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm, "
                 f"{imaging.wavelength_nm:g} nm, field radius {imaging.field_radius_mm:g} mm",
-                *path_in_words(self),
+                *format_path(self),
             ]
         )
 
@@ -113,7 +112,7 @@ class Design(Table):
     @property
     def refractive_index(self) -> float:
         """Index of lenses and plate at the design's wavelength."""
-        return plate_index(self)
+        return index_of(self.lens.refractive_index, self.imaging.wavelength_nm)
 
     def imager(self, sample: str | Sample | None = None, wavelength_nm: float | None = None) -> Imager:
         """The geometry of this design: mm and radians.
@@ -158,6 +157,7 @@ class Design(Table):
             conic_constant=_one_if_alike(lens.conic_constant),
             aspheric_terms=lens.aspheric_terms,
         )
+        medium = sample if isinstance(sample, Sample) else sample_table(self, sample)
         try:
             return Imager(
                 array,
@@ -170,16 +170,11 @@ class Design(Table):
                 tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
                 filters=layers_of(self.layers.object, wavelength),
                 windows=layers_of(self.layers.sensor, wavelength),
-                sample=chosen_sample(self, sample, wavelength),
-                band=self._band(sample) if wavelength_nm is None else None,
+                sample=medium if isinstance(medium, Sample) else sample_of(medium, wavelength),
+                band=emission_band(self, medium) if wavelength_nm is None else None,
             )
         except ValueError as error:  # of a `Sample` that is given: the rest is checked
             raise InputError(str(error)) from error
-
-    def _band(self, sample: str | Sample | None):
-        """The emission band, with the indices of the materials of the lenses, the layers and a sample."""
-        table = sample if isinstance(sample, Sample) else sample_table(self, sample)
-        return emission_band(self.imaging, self.lens, self.layers, table)
 
     @classmethod
     def from_imager(

@@ -1,7 +1,7 @@
 """Designs to start from: the paper's, defaults of what a lab does not know, and the documentation of all keys.
 
-Documentation is that of comments in files, of the schema for editors and of the page of keys. It is read from the
-fields of the tables, whose titles are meanings and whose descriptions are allowed values.
+The documentation serves comments in files, the schema for editors and the page of keys. It is read from the fields of
+the tables, whose titles are meanings and whose descriptions are allowed values.
 """
 
 import math

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..lenses import sag_slope_over_r
-from .conversion import check_band, check_path, object_begins, plate_index, reduced_depth, reduced_sensor_distance
+from .conversion import check_band, check_path, object_begins, reduced_depth, reduced_sensor_distance
 from .tables import LENS_KEYS
 
 MIN_SPACING_MM = 1e-3
@@ -294,7 +294,7 @@ def _unlikely(design) -> Iterator[str]:
     v = imaging.sensor_distance_mm
     behind = reduced_sensor_distance(design, v) - v
     radius, diameters = np.array(lens.radius_of_curvature_mm, float), np.array(lens.aperture_diameter_mm, float)
-    f = np.array(lens.focal_length_mm or radius / (plate_index(design) - 1))
+    f = np.array(lens.focal_length_mm or radius / (design.refractive_index - 1))
     least, most = float(f.min()), float(f.max())
     focal = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
     depths = f"{near:g} to {far:g} mm"
