@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gs_jax as gs
-from gs_jax.base.errors import InputError, InputWarning
+from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design, checked_design
@@ -125,23 +125,6 @@ def test_a_design_with_samples_needs_a_default_or_a_choice(tmp_path):
     assert "samples by name: gel, water and no default" in str(design) and "no default" not in str(dry)
     shape = check_design(design, MoldShape(), chord=4e-4, resolution=0.025)
     assert all(result.level != "error" for result in shape)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"sample": {"refractive_index": 2.4}}, "sample.refractive_index = 2.4: is it meant? Usual is 1 to 2."),
-        (
-            {"samples": {"gel": {"refractive_index": 1.3, "layers": [{"thickness_mm": 170.0}]}}},
-            "samples.gel.layers[0].thickness_mm = 170: did you mean 0.17 mm (170 um)?",
-        ),
-        ({"sample": {"refractive_index": 1.43, "surface_mm": 19.0}}, "The object's medium begins at 19 mm."),
-    ],
-)
-def test_questions(changes, words):
-    with pytest.warns(InputWarning) as said:
-        design_of(changes)
-    assert len(said) == 1 and words in str(said[0].message)
 
 
 @pytest.mark.parametrize(
