@@ -22,18 +22,14 @@ _RADII = 64
 
 def check_whole(design) -> None:
     """Raise `ValueError` unless the numbers, the plate, the lenses and the sensor of a design fit together."""
-    for check in (_check_numbers, _check_lenses, check_path, _check_plate, _check_spacing, _check_reach):
-        check(design)
-
-
-_CENTERS = "`array.centers_mm`"
-
-
-def _check_numbers(design) -> None:
     check_band(design.imaging)
     near, far = design.imaging.working_distance_mm
     if not near < far:
         raise ValueError(f"`imaging.working_distance_mm` must be [near, far], near below far, got [{near}, {far}]")
+    _check_lenses(design)
+    check_path(design)
+    _check_plate(design)
+    _check_reach(design)
 
 
 def of_each(design, key: str) -> tuple[float, ...]:
@@ -45,11 +41,11 @@ def of_each(design, key: str) -> tuple[float, ...]:
 def _check_lenses(design) -> None:
     lens, count = design.lens, len(design.array.centers_mm)
     for key in LENS_KEYS:
-        if (found := len(of_each(design, key))) != count:
-            raise ValueError(f"`lens.{key}` must be one number or {count}, one a lens, got {found}")
+        if (given := len(of_each(design, key))) != count:
+            raise ValueError(f"`lens.{key}` must be one number or {count}, one a lens, got {given}")
     first: dict[tuple[float, ...], int] = {}
-    for number, one in enumerate(zip(*(of_each(design, key) for key in LENS_KEYS), strict=True), 1):
-        first.setdefault(one, number)
+    for number, shape in enumerate(zip(*(of_each(design, key) for key in LENS_KEYS), strict=True), 1):
+        first.setdefault(shape, number)
     for (radius, aperture, conic), number in first.items():
         of_lens = f" of lens {number}" if len(first) > 1 else ""
         if aperture > (end := widest_diameter(radius, conic)):
@@ -70,13 +66,16 @@ def widest_diameter(radius: float, conic_constant: float) -> float:
 
 
 def _check_plate(design) -> None:
-    centers = np.array(design.array.centers_mm)
-    half = np.array(design.array.size_mm) / 2
+    """All lenses are on the plate, and apart."""
+    centers, half = np.array(design.array.centers_mm), np.array(design.array.size_mm) / 2
     outside = (np.abs(centers) > half + 1e-9).any(axis=1)
     if outside.any():
         plate = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
         lens = _lens(design, int(np.argmax(outside)))
-        raise ValueError(f"{_CENTERS} must be {plate}, got {lens}{_other_reading(centers, half)}")
+        raise ValueError(f"`array.centers_mm` must be {plate}, got {lens}{_other_reading(centers, half)}")
+    if pair := _close_pair(centers):
+        got = f"{_lens(design, pair[0])} and lens {pair[1] + 1} nearer to it"
+        raise ValueError(f"`array.centers_mm` must be at least {MIN_SPACING_MM} mm apart, got {got}")
 
 
 def _other_reading(centers: np.ndarray, half: np.ndarray) -> str:
@@ -90,12 +89,6 @@ def _other_reading(centers: np.ndarray, half: np.ndarray) -> str:
     if positive and (reach / 1000 <= 2 * half).all() and (reach / 1000 > half).any():
         return '; are they micrometres from a corner (`centers_unit = "um"`, `centers_origin = "corner"`)?'
     return ""
-
-
-def _check_spacing(design) -> None:
-    if pair := _close_pair(np.array(design.array.centers_mm)):
-        got = f"{_lens(design, pair[0])} and lens {pair[1] + 1} nearer to it"
-        raise ValueError(f"{_CENTERS} must be at least {MIN_SPACING_MM} mm apart, got {got}")
 
 
 def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
@@ -122,7 +115,9 @@ def _check_reach(design) -> None:
     if beyond.all() or (beyond.any() and design.sensor.origin_mm is None):
         index = int(np.argmax(beyond))
         most = f"at most {radius:.4g} mm beside the sensor, the radius of a lens's image of the field"
-        raise ValueError(f"{_CENTERS} must be {most}, got {_lens(design, index)}, {distance[index]:.4g} mm beside it")
+        raise ValueError(
+            f"`array.centers_mm` must be {most}, got {_lens(design, index)}, {distance[index]:.4g} mm beside it"
+        )
 
 
 def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
@@ -175,14 +170,11 @@ USUAL: dict[str, tuple[float, float]] = {
 _FACTORS = (1e-3, 1e3, 1e-6, 1e6, 1e9)
 _LADDER = ("nm", "um", "mm", "m")
 # Larger numbers are not lengths, and larger integers not floats.
-_ENDLESS = 1e30
-# Largest usual ratio of the sensor distance and the distance of the image.
-_OFF = 3.0
-# Largest usual field radius in units of the depth: 63 degrees.
-_WIDEST = 2.0
+_LARGEST = 1e30
+# Largest usual ratio of sensor distance and image distance, and of field radius and depth (63 degrees).
+_MOST_OFF, _WIDEST = 3.0, 2.0
 # Lenses closer than their diameter over this number are in another unit, such as metres that are read as mm.
 _CLOSEST = 50.0
-
 # Lenses whose nearest neighbour is computed.
 _SOME = 100
 
@@ -192,25 +184,24 @@ def slips(data: Mapping[str, Any]) -> list[str]:
 
     `data`: the tables of a file; entries that are not numbers are ignored.
     """
-    found = [(key, place, value) for key in USUAL for place, value in _values(data, key)]
-    return [question for key, place, value in found if (question := slip(key, value, place))]
+    questions = (slip(key, value, name) for key in USUAL for name, value in _values(data, key))
+    return [question for question in questions if question]
 
 
-def slip(key: str, value: Any, place: str | None = None) -> str | None:
-    """The question about a value of a key, which is called `place`; None if it is usual, or not a positive number."""
+def slip(key: str, value: Any, name: str | None = None) -> str | None:
+    """The question about a value of a key, called `name` in it; None if it is usual, or not a positive number."""
     numbers = _positive(value)
     (low, high), unit = USUAL[key], unit_of(key)
-    if not numbers or all(low <= each <= high for each in numbers):
+    if not numbers or all(low <= number <= high for number in numbers):
         return None
-    found = f"{place or key} = {_numbers(numbers)}"
-    if question := other_unit(numbers, USUAL[key], unit):
-        return f"{found}: {question}"
-    return f"{found}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+    question = other_unit(numbers, USUAL[key], unit)
+    question = question or f"is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+    return f"{name or key} = {_numbers(numbers)}: {question}"
 
 
 def other_unit(numbers: list[float], usual: tuple[float, float], unit: str) -> str | None:
     """Ask whether unusual numbers are in another unit, in which they would be usual; None if there is no such unit."""
-    if not numbers or all(usual[0] <= each <= usual[1] for each in numbers):
+    if not numbers or all(usual[0] <= number <= usual[1] for number in numbers):
         return None
     if (other := _other(usual, unit, numbers)) is None:
         return None
@@ -220,7 +211,7 @@ def other_unit(numbers: list[float], usual: tuple[float, float], unit: str) -> s
 
 
 def meant(key: str, value: Any) -> float | list[float] | None:
-    """The usual value, in the key's unit, of a value that is in another unit; None if there is none."""
+    """The value converted to the key's unit if it looks as if it was given in another one; otherwise None."""
     if slip(key, value) is None or (other := _other(USUAL[key], unit_of(key), _positive(value))) is None:
         return None
     return other[0] if isinstance(value, list | tuple) else other[0][0]
@@ -240,8 +231,8 @@ def unit_of(key: str) -> str:
 def _positive(value: Any) -> list[float]:
     """The positive numbers of a value as floats; empty for anything else."""
     numbers = list(value) if isinstance(value, list | tuple) else [value]
-    right = all(type(each) in (int, float) and 0 < each < _ENDLESS for each in numbers)
-    return [float(each) for each in numbers] if right else []
+    is_right = all(type(number) in (int, float) and 0 < number < _LARGEST for number in numbers)
+    return [float(number) for number in numbers] if is_right else []
 
 
 def _other(usual: tuple[float, float], unit: str, numbers: list[float]) -> tuple[list[float], str | None] | None:
@@ -250,15 +241,15 @@ def _other(usual: tuple[float, float], unit: str, numbers: list[float]) -> tuple
         return None
     low, high = usual
     for factor in _FACTORS:
-        scaled = [float(f"{each * factor:.9g}") for each in numbers]
-        if all(low <= each <= high for each in scaled):
+        scaled = [float(f"{number * factor:.9g}") for number in numbers]
+        if all(low <= number <= high for number in scaled):
             step = _LADDER.index(unit) + round(math.log10(factor) / 3)
             return scaled, _LADDER[step] if 0 <= step < len(_LADDER) else None
     return None
 
 
 def _values(data: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
-    """All values of a key, with what each is called; those of `[sample]` in `[samples]` too."""
+    """All values of a key with their names; those of `[sample]` in `[samples]` too."""
     table, _, name = key.partition(".")
     inner = data.get(table)
     if table == "lens" and isinstance(inner, Mapping) and (numbers := sorted(set(_positive(inner.get(name))))):
@@ -266,18 +257,19 @@ def _values(data: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
     else:
         yield from _within(data, key.split("."), "")
     if table == "sample" and isinstance(named := data.get("samples"), Mapping):
-        for each, one in named.items():
-            yield from _within(one, name.split("."), f"samples.{each}")
+        for sample, inner in named.items():
+            yield from _within(inner, name.split("."), f"samples.{sample}")
 
 
-def _within(node: Any, steps: list[str], place: str) -> Iterator[tuple[str, Any]]:
+def _within(node: Any, steps: list[str], path: str) -> Iterator[tuple[str, Any]]:
+    """Yield the values at the end of some steps into tables and lists of tables, with their paths."""
     if not steps:
-        yield place, node
+        yield path, node
     elif isinstance(node, Mapping) and steps[0] in node:
-        yield from _within(node[steps[0]], steps[1:], f"{place}.{steps[0]}".removeprefix("."))
+        yield from _within(node[steps[0]], steps[1:], f"{path}.{steps[0]}".removeprefix("."))
     elif isinstance(node, list | tuple):
-        for i, each in enumerate(node):
-            yield from _within(each, steps, f"{place}[{i}]")
+        for i, inner in enumerate(node):
+            yield from _within(inner, steps, f"{path}[{i}]")
 
 
 def _numbers(values: list[float]) -> str:
@@ -288,41 +280,37 @@ def _numbers(values: list[float]) -> str:
 def _unlikely(design) -> Iterator[str]:
     lens, array, imaging = design.lens, design.array, design.imaging
     near, far = imaging.working_distance_mm
-    if near < (begins := object_begins(design)):
-        said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
-        yield f"{said} The object's medium begins at {begins:g} mm."
+    working, depths = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?", f"{near:g} to {far:g} mm"
+    if near < (start := object_begins(design)):
+        yield f"{working} The object's medium begins at {start:g} mm."
     v = imaging.sensor_distance_mm
     behind = reduced_sensor_distance(design, v) - v
     radius, diameters = np.array(lens.radius_of_curvature_mm, float), np.array(lens.aperture_diameter_mm, float)
     f = np.array(lens.focal_length_mm or radius / (design.refractive_index - 1))
     least, most = float(f.min()), float(f.max())
     focal = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
-    depths = f"{near:g} to {far:g} mm"
-    if reduced_depth(design, near) <= least:
-        said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
-        yield f"{said} Nearer than the focal length, {focal} mm, no real image forms."
+    nearest, farthest = reduced_depth(design, near), reduced_depth(design, far)
+    if nearest <= least:
+        yield f"{working} Nearer than the focal length, {focal} mm, no real image forms."
     else:
-        nearest, farthest = reduced_depth(design, near), reduced_depth(design, far)
-        image = lambda f, reduced: 1 / (1 / f - 1 / reduced) - behind if reduced > f else math.inf
-        longest, shortest = image(most, nearest), image(least, farthest)
-        if not shortest / _OFF <= v <= longest * _OFF:
-            said = f"imaging.sensor_distance_mm = {v:g}: is it meant?"
-            yield f"{said} Lenses of f = {focal} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
+        longest = 1 / (1 / most - 1 / nearest) - behind if nearest > most else math.inf
+        shortest = 1 / (1 / least - 1 / farthest) - behind
+        if not shortest / _MOST_OFF <= v <= longest * _MOST_OFF:
+            images = f"Lenses of f = {focal} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
+            yield f"imaging.sensor_distance_mm = {v:g}: is it meant? {images}"
     if (field := imaging.field_radius_mm) > _WIDEST * far:
         yield f"imaging.field_radius_mm = {field:g}: is it meant? A lens sees so far beside its axis at {depths}."
     if (diameter := float(diameters.max())) > 2 * (plate_size := max(array.size_mm)):
         yield f"lens.aperture_diameter_mm = {diameter:g}: is it meant? The whole plate is {plate_size:g} mm."
     pitch = _pitch(np.array(array.centers_mm, float))
     if pitch < diameter / _CLOSEST:
-        yield (
-            f"array.centers_mm: lenses of {diameter:g} mm are {pitch:.3g} mm apart; did you mean "
-            f"{pitch * 1000:.3g} mm, a list in another unit?"
-        )
+        meant = f"did you mean {pitch * 1000:.3g} mm, a list in another unit?"
+        yield f"array.centers_mm: lenses of {diameter:g} mm are {pitch:.3g} mm apart; {meant}"
     half = np.minimum(np.minimum(diameters, pitch) / 2, radius)
     height = float(np.max(radius - np.sqrt(radius**2 - half**2)))  # of spheres, which others are not far from
     if 0 < (thickness := array.substrate_thickness_mm) < height and not lens.focal_length_mm:
-        said = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
-        yield f"{said} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."
+        question = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
+        yield f"{question} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."
 
 
 def _pitch(centers: np.ndarray) -> float:
