@@ -21,7 +21,7 @@ import click
 
 from ._version import __version__
 from .base.errors import InputError, InputWarning
-from .cli.command import ARGUMENTS, partial_outputs
+from .cli.commands import ARGUMENTS, partial_outputs
 from .io.files import remove_temporaries
 
 # Longer messages are cut: their ends matter least.

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from gs_jax.__main__ import COMMANDS, commands, interrupt_message
 from gs_jax.cli import options
-from gs_jax.cli.command import RESUMABLE
+from gs_jax.cli.commands import RESUMABLE
 from gs_jax.cli.reconstruct import deconvolve_command
 from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights

@@ -9,7 +9,7 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import side_file
-from .command import check_outputs, command, provenance_of
+from .commands import check_outputs, command, provenance_of
 from .options import CaptureOptions, DepthLight, DesignPath, Parsed, ask_for_unit
 
 # Names of quantities, of which the first four are always fitted.

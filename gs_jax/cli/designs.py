@@ -10,7 +10,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.files import checkpoint_path, make_folder, write_json
-from .command import PARTIAL, RESUMABLE, check_outputs, command, partial_outputs, plural, provenance_of
+from .commands import PARTIAL, RESUMABLE, check_outputs, command, partial_outputs, plural, provenance_of
 from .options import DepthList, DesignPath, Light, Mm, Um, WorkerOptions, objects_in, shipped_designs
 
 

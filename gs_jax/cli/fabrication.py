@@ -10,7 +10,7 @@ from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import side_file, write_json
-from .command import check_outputs, command, given_options, provenance_of
+from .commands import check_outputs, command, given_options, provenance_of
 from .options import DepthList, DesignPath, Light, Number, Seed, Um, objects_in
 
 SmallUm = Annotated[float, Number(1e-3, 1e3, "um")]

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import click
 
 from ..base.errors import InputError, errors_name_file
-from .command import OptionGroup, check_outputs, command, given_options, print_warning, provenance_of
+from .commands import OptionGroup, check_outputs, command, given_options, print_warning, provenance_of
 
 # Keys of the file that are options, in the order of the questions.
 _KEYS = (

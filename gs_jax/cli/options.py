@@ -17,7 +17,7 @@ import click
 
 from ..base.errors import InputError, InputWarning, input_error
 from ..base.workers import Workers
-from .command import OptionGroup, print_warning
+from .commands import OptionGroup, print_warning
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MAX_DEPTHS = 10_000

@@ -9,7 +9,7 @@ import click
 from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
-from .command import PARTIAL, check_outputs, command, given_options, partial_outputs, provenance_of
+from .commands import PARTIAL, check_outputs, command, given_options, partial_outputs, provenance_of
 from .options import CAPTURE_OPTIONS, CaptureOptions, DesignPath, Light, objects_in
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..base.errors import InputError, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output
-from .command import (
+from .commands import (
     OptionGroup,
     check_may_write,
     check_outputs,

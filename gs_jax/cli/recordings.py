@@ -18,7 +18,7 @@ import numpy as np
 from ..base.errors import InputError, InputWarning
 from ..base.progress import Progress
 from ..base.workers import Workers
-from .command import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
+from .commands import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
 from .options import CaptureOptions, Number, Um, objects_in, voxels
 
 # Failed frames that are named; others are only counted, and listed in the journal.

@@ -8,7 +8,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from .command import check_outputs, command, given_options, provenance_of
+from .commands import check_outputs, command, given_options, provenance_of
 from .options import PSFS, SIMULATED, Counts, DepthLight, DesignPath, Number, Seed, ask_for_unit, objects_in
 
 # Options of the exposure.

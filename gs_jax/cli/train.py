@@ -10,7 +10,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.files import check_output, checkpoint_path, side_file, write_json
-from .command import (
+from .commands import (
     PARTIAL,
     RESUMABLE,
     OptionGroup,
