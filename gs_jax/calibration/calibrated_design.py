@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from rich.table import Table
 
 from ..base.errors import errors_name_file
-from ..design.conversion import default_sample, layers_of, medium_in_words, sample_table, sample_tables
+from ..design.conversion import default_sample, format_medium, layers_of, sample_table, sample_tables
 from ..design.design import Design
 from ..design.tables import LENS_KEYS
 from ..design.validation import reach
@@ -61,7 +61,7 @@ def apply_calibration(
         "calibrated_rms_pixels": round(result.rms, 4),
         "calibrated_spots": len(result.residuals),
         "calibrated_captures": len(np.unique(result.sources.captures[result.spots.sources])),
-        "calibrated_in": medium_in_words(imager),
+        "calibrated_in": format_medium(imager),
         "mirrored": result.mirrored,
         "calibrated_values": {name: rounded(value) for name, value in result.values.items()},
         "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in result.deviations.items()},

@@ -79,7 +79,7 @@ def calibrate_command(
     from ..calibration.fit import PATTERN_FITTED, SELF_FITTED, calibrate, self_calibrate
     from ..calibration.sources import MisfitError, Sources
     from ..calibration.spot_model import FITTED, OF_SAMPLE, with_surface
-    from ..design.conversion import medium_in_words
+    from ..design.conversion import format_medium
     from ..design.design import read_design, write_design
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
@@ -139,7 +139,7 @@ def calibrate_command(
     _print_fits(pictures, outcome.captures)
     mirrored = ", the array mirrored (y to -y) and rotated" if outcome.mirrored else ""
     lenses = f", {len(outcome.imager.array.centers)} lenses found" if find_lenses else ""
-    click.echo(f"sources in {medium_in_words(outcome.imager)}{_other_samples(light, microscope)}")
+    click.echo(f"sources in {format_medium(outcome.imager)}{_other_samples(light, microscope)}")
     click.echo(f"{output}: {len(outcome.residuals)} spots, {outcome.rms:.3f} pixels RMS{mirrored}{lenses}")
 
 

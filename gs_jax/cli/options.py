@@ -386,9 +386,9 @@ class DepthLight(Light):
 
 def objects_in(imager) -> str:
     """The medium that a command takes to hold the object, as text."""
-    from ..design.conversion import medium_in_words
+    from ..design.conversion import format_medium
 
-    return f"objects in {medium_in_words(imager)}"
+    return f"objects in {format_medium(imager)}"
 
 
 def ask_for_unit(path, points) -> None:

@@ -64,8 +64,8 @@ def sample_table(design, name: str | None) -> SampleTable:
     return NO_SAMPLE if name in _NO_SAMPLE else design.samples[name]
 
 
-def medium_in_words(imager: Imager) -> str:
-    """What holds the object, and the layers between it and the array."""
+def format_medium(imager: Imager) -> str:
+    """The medium of the object, and the layers between it and the array, as text."""
     sample, medium = imager.sample, "air"
     if sample is not None:
         medium = f"n = {float(sample.refractive_index):.4g} from z = {float(imager.sample_surface):.5g} mm"

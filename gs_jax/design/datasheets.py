@@ -25,10 +25,8 @@ from ..optics.pupil import emission_lines
 from ..optics.raytrace import to_numpy, trace_lenslet
 from .design import Design
 
-# Sizes of a point's image in the object, on a lens's axis and over its field.
-SIZES = ("fwhm_um", "rms_width_um", "half_light_radius_um", "spot_radius_um")
-# Depths of a datasheet whose caller names none.
-_DEPTHS = 7
+# Sizes of a point's image in the object, on a lens's axis and over its field; depths if the caller names none.
+SIZES, _DEPTHS = ("fwhm_um", "rms_width_um", "half_light_radius_um", "spot_radius_um"), 7
 
 
 def parts_of(
@@ -86,8 +84,8 @@ def datasheet(
     InputError
         If a depth or the circle_of_confusion is not positive and finite, or there is no depth.
     """
-    ends = design.imaging.working_distance_mm
-    depths = [float(depth) for depth in (np.linspace(*ends, _DEPTHS) if depths is None else depths)]
+    default = np.linspace(*design.imaging.working_distance_mm, _DEPTHS)
+    depths = [float(depth) for depth in (default if depths is None else depths)]
     if not depths or not all(0 < depth < math.inf for depth in depths):
         raise InputError(f"`depths` must be one or more positive lengths, mm, got {short_repr(depths)}.")
     parts, imager = parts_of(design, depths, circle_of_confusion=circle_of_confusion), design.imager()

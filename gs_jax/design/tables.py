@@ -8,7 +8,6 @@ from jaxtyping import Float
 from pydantic import Field, Tag, ValidationError
 
 from ..base.errors import InputError, errors_name_file
-from ..geometry import LONGEST, SHORTEST
 from ..io.names import PIXELS, in_mm, unit_of_name
 from ..io.point_tables import read_columns, write_rows
 from ..io.provenance import Provenance
@@ -23,17 +22,11 @@ MAX_LENSES, _MAX_LINES = 100_000, 100_000
 LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
 
 
-def _short(number: float) -> str:
-    """The shortest text of a round number, such as 1e-6, 1e4 or 100."""
-    plain, power = f"{number:g}", f"{number:.0e}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
-    return power if float(power) == number and len(power) < len(plain) else plain
-
-
 # Descriptions are the allowed values, titles the meaning of a key: error messages, comments in files, the schema for
 # editors and the page of keys are made of them.
-def _within(unit: str, least: float, most: float) -> Any:
+def _within(unit: str, least: str, most: str) -> Any:
     """A range of numbers of a unit, and its description."""
-    return Field(ge=least, le=most, description=f"a number of {unit} from {_short(least)} to {_short(most)}")
+    return Field(ge=float(least), le=float(most), description=f"a number of {unit} from {least} to {most}")
 
 
 def _allowed(description: str, **more: Any) -> Any:
@@ -41,10 +34,10 @@ def _allowed(description: str, **more: Any) -> Any:
     return Field(strict=False, description=description, **more)
 
 
-Length = Annotated[float, _within("mm", 1e-6, 1e4)]
+Length = Annotated[float, _within("mm", "1e-6", "1e4")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Pixels = Annotated[int, Field(ge=2, le=65536)]
-Wavelength = Annotated[float, _within("nanometres", 1e6 * SHORTEST, 1e6 * LONGEST)]
+Wavelength = Annotated[float, _within("nanometres", "10", "1e5")]
 Slope = Annotated[float, Field(ge=-10, le=10)]
 _POINT = _allowed("[x, y] in mm, up to 1e4")
 Point = Annotated[tuple[Coordinate, Coordinate], _POINT]
@@ -98,7 +91,7 @@ class SensorTable(Table):
     `origin_mm` is the region's middle. At least one lens has to have an image on a region.
     """
 
-    pixel_pitch_um: Annotated[float, _within("micrometres", 1e-3, 1e4)] = Field(
+    pixel_pitch_um: Annotated[float, _within("micrometres", "1e-3", "1e4")] = Field(
         title="distance of neighbouring pixels' centres; pixels are square"
     )
     shape: Shape = Field(title="size of the image in pixels: rows (y) first, then columns (x)")
@@ -132,7 +125,7 @@ class LensTable(Table):
         default=(),
         title="[A4, A6, ...] of the curved side, for millimetres; a lens must fall all the way from its vertex",
     )
-    focal_length_mm: Annotated[float | None, _within("mm", 1e-6, 1e4)] = Field(
+    focal_length_mm: Annotated[float | None, _within("mm", "1e-6", "1e4")] = Field(
         default=None,
         title="f of an ideal thin lens, in place of the sphere that the radius describes; leave it out for real lenses",
     )
@@ -142,7 +135,7 @@ class ArrayTable(Table):
     """`[array]`: the plate and where its lenses are. `centers_file` is replaced by its content on reading."""
 
     size_mm: Size = Field(title="width (x) and height (y) of the plate, with its middle at [0, 0]")
-    substrate_thickness_mm: Annotated[float, _within("mm", 0, 1e4)] = Field(
+    substrate_thickness_mm: Annotated[float, _within("mm", "0", "1e4")] = Field(
         title="t of the plate, from its plano face to the lens vertices"
     )
     centers_mm: Centers = Field(
@@ -160,7 +153,7 @@ class ImagingTable(Table):
         title="nearest and farthest object: depths z from the array's front, plano face or lens vertices, positive"
     )
     wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
-    bandwidth_nm: Annotated[float, _within("nanometres", 0, 1e4)] = Field(
+    bandwidth_nm: Annotated[float, _within("nanometres", "0", "1e4")] = Field(
         default=0.0,
         title="full width of an even emission band about `wavelength_nm`, over which PSFs are means; 0 for none",
     )
@@ -203,7 +196,7 @@ class SampleTable(Table):
     """`[sample]`: the medium that holds the object, or `[samples.NAME]`."""
 
     refractive_index: Index = Field(title="n of the object's medium at the wavelength; 1, air, is no sample")
-    surface_mm: Annotated[float | None, _within("mm", 0, 1e4)] = Field(
+    surface_mm: Annotated[float | None, _within("mm", "0", "1e4")] = Field(
         default=None,
         title="depth at which the medium begins, from the array's front; without it the medium begins where layers end",
     )
@@ -219,7 +212,7 @@ class CalibrationTable(Table):
     The tilt is by how much the array's plane rises toward the object along +x and +y.
     """
 
-    rotation_deg: Annotated[float, _within("degrees", -360, 360)] = Field(
+    rotation_deg: Annotated[float, _within("degrees", "-360", "360")] = Field(
         default=0.0,
         title="turn of the array about its middle, from +x toward +y: clockwise in the image as it is shown",
     )
