@@ -26,28 +26,18 @@ from .io.files import remove_temporaries
 
 # Longer messages are cut: their ends matter least.
 _MAX_MESSAGE = 380
-# The module of each command in `gs_jax/cli`, imported when the command is used: some need seconds that others do not.
-COMMANDS = {
-    "reconstruct": "reconstruct",
-    "calibrate": "calibrate",
-    "simulate": "simulate",
-    "deconvolve": "reconstruct",
-    "metrics": "designs",
-    "new-design": "new_design",
-    "layout": "designs",
-    "optimize": "designs",
-    "pareto": "designs",
-    "tolerance": "fabrication",
-    "benchmark": "presentation",
-    "mold": "fabrication",
-    "mask": "fabrication",
-    "heights": "fabrication",
-    "train": "train",
-    "report": "presentation",
-    "explore": "presentation",
-    "demo": "presentation",
-    "info": "designs",
+# Commands by their modules in `gs_jax/cli`, imported when a command is used: some need seconds that others do not.
+_MODULES = {
+    "reconstruct": ("reconstruct", "deconvolve"),
+    "calibrate": ("calibrate",),
+    "simulate": ("simulate",),
+    "designs": ("metrics", "layout", "optimize", "pareto", "info"),
+    "new_design": ("new-design",),
+    "fabrication": ("tolerance", "mold", "mask", "heights"),
+    "presentation": ("report", "explore", "benchmark", "demo"),
+    "train": ("train",),
 }
+COMMANDS = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def main(leave: Callable[[int], object] = sys.exit) -> None:
