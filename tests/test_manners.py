@@ -65,6 +65,7 @@ def test_help_imports_nothing_heavy():
     for name in COMMANDS:
         command = commands.get_command(context, name)
         assert command and command.help and command.get_short_help_str(200).endswith(".")
+        assert all(param.help for param in command.params if isinstance(param, click.Option)), name
 
 
 def test_without_arguments_it_shows_its_help(monkeypatch, capsys):

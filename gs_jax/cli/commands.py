@@ -95,7 +95,7 @@ def _parameters(documented: Any) -> Iterator[click.Parameter]:
         if _is_group(parameter.annotation):
             yield from _parameters(parameter.annotation)
         elif parameter.kind is parameter.KEYWORD_ONLY or _is_group(documented):
-            yield _option(parameter, texts[parameter.name])
+            yield _option(parameter, texts.get(parameter.name, ""))  # without docstrings (python -OO) no help
         elif parameter.kind is not parameter.VAR_KEYWORD:
             required = parameter.default is parameter.empty
             yield click.Argument([parameter.name], required=required, **_type(parameter.annotation))
