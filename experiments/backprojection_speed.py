@@ -30,8 +30,7 @@ from matplotlib.figure import Figure
 from experiments.common import Report, main, table
 from experiments.kernels import count_pairs, cuda_kernels, lens_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Progress, Sensor, backproject, backproject_adjoint, random_layout
-from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.method_benchmark import peak_mib, timed
+from gs_jax.apps.benchmark import markdown_table, peak_mib, timed
 from gs_jax.base.arrays import to_float32
 from gs_jax.base.machine import describe, status_mib
 

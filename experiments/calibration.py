@@ -29,7 +29,7 @@ from scipy.optimize import least_squares
 
 import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.calibration.calibrated_design import plot_residuals
 from gs_jax.calibration.fit import Calibration, self_calibrate, spot_residuals
 from gs_jax.calibration.spot_model import OF_DEVICE

@@ -35,7 +35,7 @@ import gs_jax as gs
 from experiments.common import Report, cropped, design_file, designs_by_name, main, read_records, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset

@@ -40,7 +40,7 @@ from experiments.design_judge import (
 )
 from experiments.ray_tracer import bundles
 from gs_jax import Design, Imager, Progress, geomscope, quality, random_layout, rasterize, read_design
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.codesign.terms import TERMS
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.layouts import hexagonal_layout

@@ -27,7 +27,7 @@ import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, design_of, local_maxima, main, points_of, table
 from experiments.phantoms import beads
 from experiments.point_density import scene, scores as density_scores
-from gs_jax.apps.method_benchmark import timed
+from gs_jax.apps.benchmark import timed
 from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.clusters import find_clusters
 from gs_jax.simulation.synthetic import simulate_points

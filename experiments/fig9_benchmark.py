@@ -33,8 +33,7 @@ from experiments.common import Report, local_maxima, main, points_of
 from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
-from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.method_benchmark import render_points, timed
+from gs_jax.apps.benchmark import markdown_table, render_points, timed
 from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.unet import pretrained

@@ -22,9 +22,8 @@ from experiments import fig3_resolution, fig4_suppression, fig6_usaf, fig8_snowf
 from experiments.backprojection_speed import Job, race
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax import Progress
-from gs_jax.apps import benchmark_report as benchmark
-from gs_jax.apps.benchmark_report import markdown_table, time_exponents
-from gs_jax.apps.method_benchmark import run as run_benchmark
+from gs_jax.apps import benchmark
+from gs_jax.apps.benchmark import markdown_table, run as run_benchmark, time_exponents
 
 
 class Claim(NamedTuple):

@@ -22,7 +22,7 @@ import numpy as np
 import gs_jax as gs
 from experiments.backprojection_speed import in_new_process
 from experiments.common import Report, main, table
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.base.machine import status_mib
 from gs_jax.reconstruction.inverse_problem import prepare_model
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid

@@ -21,7 +21,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 from experiments.common import Report, main, table
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Progress, read_design, read_study
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.codesign.parameters import new_design
 from gs_jax.codesign.pareto import sweep_of, trade_off
 from gs_jax.codesign.study import Study

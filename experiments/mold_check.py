@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.common import Report, main, table
 from gs_jax import Design, Imager, Progress, geomscope, read_design
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
 from gs_jax.mold.lenslets import Part
 from gs_jax.mold.measurement import measure_lenslets, summarize

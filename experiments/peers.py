@@ -26,7 +26,7 @@ import tifffile
 
 from experiments.common import Report, main, table
 from gs_jax import Progress
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.base.machine import describe
 
 # Planes of the stack that the example takes, the weights of its priors, and the steps of each code.

@@ -29,7 +29,7 @@ from experiments.common import Report, cropped, main, table
 from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, InputError, Progress, Reconstructor, Sensor, Surface, quality, rasterize, read_design
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.surface_fit import fit_sheets
 

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from experiments.common import Report, main, table
 from gs_jax import Design, Progress, geomscope, objectives
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.design.datasheets import datasheet
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory

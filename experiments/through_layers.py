@@ -23,7 +23,7 @@ import numpy as np
 import gs_jax as gs
 from experiments.common import Report, main, table
 from experiments.true_image import BLACK, GAIN, scores, strokes
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 

@@ -29,7 +29,7 @@ from scipy.spatial import KDTree
 import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from experiments.ray_tracer import traced
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.geometry import envelope
 from gs_jax.lenses import Orientation
 from gs_jax.optics.aberrations import best_focus

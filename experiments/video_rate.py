@@ -26,7 +26,7 @@ import tifffile
 
 from experiments.common import Report, main, table
 from gs_jax import Design, Progress, Reconstructor, geomscope, simulate, write_design
-from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.io.camera import prepare, read_frame
 from gs_jax.io.captures import Selection
 from gs_jax.io.recordings import open_recording

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.apps import benchmark_report, method_benchmark
-from gs_jax.apps.method_benchmark import METHODS, Scene, find_peaks, make_microscope, particle_width, render_points
+from gs_jax.apps import benchmark
+from gs_jax.apps.benchmark import METHODS, Scene, find_peaks, make_microscope, particle_width, render_points
 from gs_jax.projection.operators import ImagingOperator
 
 from .helpers import scene
@@ -30,17 +30,17 @@ def result():
             return type("Done", (), {"result": lambda _: value})()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(method_benchmark, "ProcessPoolExecutor", Here)
-        patch.setattr(method_benchmark, "_REPEATS", 2)
+        patch.setattr(benchmark, "ProcessPoolExecutor", Here)
+        patch.setattr(benchmark, "_REPEATS", 2)
         names = ("backproject", "backproject + clusters", "richardson-lucy", "richardson-lucy, dense", "admm, dense")
-        return method_benchmark.run((16,), methods=names, seeds=(0,))
+        return benchmark.run((16,), methods=names, seeds=(0,))
 
 
 def test_records_and_files(result, tmp_path):
     records, skipped = result
     assert len(records) == 6 and not skipped and {r["pairs"] for r in records} == {16.0**4}
-    assert all(set(record) == set(benchmark_report.COLUMNS) for record in records)
-    benchmark_report.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
+    assert all(set(record) == set(benchmark.COLUMNS) for record in records)
+    benchmark.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
     assert json.loads((tmp_path / "benchmark.json").read_text()) == {"records": records}
     with (tmp_path / "benchmark.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(records)
@@ -59,15 +59,15 @@ def test_objective_of_least_squares(result):
     assert 0 < reached.pop("admm, dense") < 0.1 and set(reached.values()) == {None}
     imager, grid, psf = make_microscope(16)
     image, empty = np.arange(256, dtype=np.float32).reshape(16, 16), np.zeros(grid.volume_shape, np.float32)
-    operator, solver = ImagingOperator(imager, grid, psf), method_benchmark.ADMM()
-    assert method_benchmark.relative_objective(empty, image, operator, solver) == pytest.approx(1)
+    operator, solver = ImagingOperator(imager, grid, psf), benchmark.ADMM()
+    assert benchmark.relative_objective(empty, image, operator, solver) == pytest.approx(1)
 
 
 def test_scores_of_nothing_and_of_the_truth():
     imager, grid, _ = make_microscope(16)
     particles, width = np.array([[0.0, 0, 20, 1]]), particle_width(imager)
     s = Scene(np.zeros((16, 16), np.float32), particles, render_points(particles, grid, width))
-    floor, best = (method_benchmark.score(volume, s, grid, width) for volume in (np.zeros_like(s.truth), s.truth))
+    floor, best = (benchmark.score(volume, s, grid, width) for volume in (np.zeros_like(s.truth), s.truth))
     assert floor["f1"] == 0 and floor["mse"] == pytest.approx((s.truth**2).mean())
     assert best["f1"] == 1 and best["psnr_db"] == math.inf
 
@@ -91,23 +91,23 @@ def test_rendered_points_and_their_peaks():
 def test_exponents_are_those_of_the_papers_range():
     records = [{"method": "m", "pairs": p, "seconds": p**0.5} for p in (1e6, 1e8, 1e9)]
     beyond = {"method": "m", "pairs": 1e12, "seconds": 1.0}
-    assert benchmark_report.time_exponents([*records, beyond])["m"] == pytest.approx(0.5)
+    assert benchmark.time_exponents([*records, beyond])["m"] == pytest.approx(0.5)
 
 
 def test_too_large_or_too_slow_methods_are_skipped():
-    reason = method_benchmark.skip_reason("richardson-lucy, dense", 2000, None, 60.0)
+    reason = benchmark.skip_reason("richardson-lucy, dense", 2000, None, 60.0)
     assert reason is not None and "GiB, more than" in reason
     last = {"seconds": 10.0, "pairs": 1e6}
     slow = "would take 100 s an image, more than 60 s"
-    assert method_benchmark.skip_reason("backproject", 100, last, 60.0) == slow
-    assert method_benchmark.skip_reason("backproject", 100, last, 200.0) is None
+    assert benchmark.skip_reason("backproject", 100, last, 60.0) == slow
+    assert benchmark.skip_reason("backproject", 100, last, 200.0) is None
     assert set(METHODS) > {"backproject", "list-rl", "admm, dense"}
 
 
 def test_command(result, tmp_path, monkeypatch):
     from gs_jax.cli.presentation import benchmark_command
 
-    monkeypatch.setattr(method_benchmark, "run", lambda callback, progress: result)
+    monkeypatch.setattr(benchmark, "run", lambda callback, progress: result)
     output = CliRunner().invoke(benchmark_command, ["--out", str(tmp_path / "new")])
     assert output.exit_code == 0 and "benchmark.json" in output.output
     written = json.loads((tmp_path / "new" / "benchmark.json").read_text())

@@ -5,7 +5,7 @@ import pytest
 from skimage.measure import label
 
 from gs_jax import Grid
-from gs_jax.apps.method_benchmark import render_points
+from gs_jax.apps.benchmark import render_points
 from gs_jax.detection.clusters import find_clusters
 
 

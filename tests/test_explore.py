@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, backproject, read_design
-from gs_jax.apps import explore_design as evaluation, explore_preview as preview
+from gs_jax.apps import explore_design
 from gs_jax.apps.explore import Server, Session
 from gs_jax.apps.explore_design import complete_values, evaluate_design, make_sliders, start_of
 from gs_jax.base.errors import InputError
@@ -92,10 +92,10 @@ def test_the_saved_design_is_the_one_shown(either):
     start = start_of(either)
     sliders = make_sliders(either)
     values = complete_values(sliders, MOVES | {"pitch_mm": 1.2 * sliders["pitch_mm"].start})
-    saved = evaluation.moved_design(either, start, values, {"command": "x"})
+    saved = explore_design.moved_design(either, start, values, {"command": "x"})
     assert saved.provenance == {"command": "x"} and saved.imaging.working_distance_mm == (17.0, 26.0)
     np.testing.assert_allclose(saved.array.centers_mm, 1.2 * np.array(either.array.centers_mm), atol=1e-4)
-    imager, expected = evaluation.moved_imager(start, values), saved.imager()
+    imager, expected = explore_design.moved_imager(start, values), saved.imager()
     np.testing.assert_allclose(imager.array.radius_of_curvature, expected.array.radius_of_curvature, atol=1e-4)
     np.testing.assert_allclose(imager.array.plate, expected.array.plate, atol=1e-4)
     numbers, sheet = evaluate_design(start, values).numbers, datasheet(saved)
@@ -106,13 +106,13 @@ def test_the_saved_design_is_the_one_shown(either):
 @pytest.mark.integration
 def test_moves_compile_nothing(either):
     start, sliders = start_of(either, STUDY), make_sliders(either)
-    compiled: list[Any] = [psf._pixel_energy, psf._even_rays, preview._sum_lenses]
+    compiled: list[Any] = [psf._pixel_energy, psf._even_rays, explore_design._sum_lenses]
     counts = []
     for moves in ({}, *({name: slider.start * 1.01} for name, slider in sliders.items())):
         values = complete_values(sliders, moves)
         result = evaluate_design(start, values)
         if not moves or {"pitch_mm", "field_radius_mm"} & {*moves}:
-            preview.reconstruct_points(start, values, result.clear_diameters)
+            explore_design.reconstruct_points(start, values, result.clear_diameters)
         counts.append([each._cache_size() for each in compiled])
     assert counts == counts[:1] * len(counts)
 
@@ -122,16 +122,16 @@ def test_targets_and_assumptions_in_words(design, monkeypatch):
     start = start_of(design, STUDY)
     moves = {"sensor_distance_mm": 7.0, "pitch_mm": 1.3 * make_sliders(design)["pitch_mm"].start}
     values = complete_values(make_sliders(design), moves)
-    result = evaluate_design(start, values, evaluation.live_terms(STUDY))
-    sentences = evaluation.find_violations(design, STUDY, start, values, result)
+    result = evaluate_design(start, values, explore_design.live_terms(STUDY))
+    sentences = explore_design.find_violations(design, STUDY, start, values, result)
     assert "Target missed: thickness: filters, plate and sensor distance (thickness_mm) is 8, not <= 7." in sentences
     for word in ("lenses_per_point", "out of focus", "mask"):
         assert any(word in each for each in sentences)
     assert not any("light_percent" in each for each in sentences)
     wide = design.replace(radius_of_curvature_mm=0.35)
     values = complete_values(make_sliders(wide), {"radius_of_curvature_mm": 0.18})
-    result = evaluate_design(start_of(wide, STUDY), values, evaluation.live_terms(STUDY))
-    sentences = evaluation.find_violations(wide, None, start_of(wide, STUDY), values, result)
+    result = evaluate_design(start_of(wide, STUDY), values, explore_design.live_terms(STUDY))
+    sentences = explore_design.find_violations(wide, None, start_of(wide, STUDY), values, result)
     assert "The aperture of 0.4 mm is wider than its sphere, which has 0.36 mm." in sentences
 
 
@@ -151,8 +151,8 @@ def test_wrong_values_are_refused(design, values, message):
 
 def test_wide_spots_are_counted_by_rays(design):
     """Both ways agree where both hold; beyond, diffraction would be folded back."""
-    start, samples = start_of(design), evaluation.pupil_samples(start_of(design))
-    unit = evaluation.lens_unit(start, complete_values(make_sliders(design), {}))
+    start, samples = start_of(design), explore_design.pupil_samples(start_of(design))
+    unit = explore_design.lens_unit(start, complete_values(make_sliders(design), {}))
     near, wide = (spot_image(unit, depth, 0.0, size=49, radius=0.2, samples=samples) for depth in (20.0, 2.0))
     assert near.sum() == pytest.approx(1, abs=0.05)
     assert 0.1 < wide.sum() <= 1 and np.count_nonzero(wide) > 50
@@ -162,7 +162,7 @@ def test_wide_spots_are_counted_by_rays(design):
 def test_a_point_is_where_its_own_images_meet(design, tilt):
     """Of lenses that all see it, the brightest cell of the map has the point."""
     tilted = design.model_copy(update={"calibration": design.calibration.model_copy(update={"tilt_deg": tilt})})
-    ghosts = preview.map_ghosts(tilted.imager(), 19.0, 21.0)
+    ghosts = explore_design.map_ghosts(tilted.imager(), 19.0, 21.0)
     row, column = np.unravel_index(ghosts.crossings.argmax(), ghosts.crossings.shape)
     left, top, right, bottom = ghosts.box
     size = ghosts.crossings.shape[0]
@@ -174,7 +174,9 @@ def test_a_point_is_where_its_own_images_meet(design, tilt):
 def test_the_small_back_projection_is_the_librarys(design):
     imager, rng = design.imager(), np.random.default_rng(0)
     grid, image = Grid([18.0, 20.0], (41, 37), 0.05, (0.1, 0.0)), rng.random(imager.sensor.shape)
-    np.testing.assert_allclose(preview._backproject(image, imager, grid), backproject(image, imager, grid), atol=1e-9)
+    np.testing.assert_allclose(
+        explore_design._backproject(image, imager, grid), backproject(image, imager, grid), atol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -182,7 +184,7 @@ def test_a_small_reconstruction_shows_its_points():
     """Of a piece of the paper's design: points are far above the rest."""
     design = read_design(Path(__file__).parents[1] / "design" / "geomscope.toml")
     values = complete_values(make_sliders(design), {"near_mm": 18.5, "far_mm": 21.5})
-    result = preview.reconstruct_points(start_of(design), values, np.array([1.6]))
+    result = explore_design.reconstruct_points(start_of(design), values, np.array([1.6]))
     assert result.contrast > 10 and result.maxima.shape == (181, 181)
 
 

@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward
-from gs_jax.apps.method_benchmark import peak_mib
+from gs_jax.apps.benchmark import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.optics.psf import gaussian_psf
 from gs_jax.optics.raytrace import to_numpy

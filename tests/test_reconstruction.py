@@ -15,7 +15,7 @@ from jax.test_util import check_grads
 
 import gs_jax as gs
 from gs_jax import Grid, ImagingOperator, backproject, forward, psf_model
-from gs_jax.apps.method_benchmark import skip_reason
+from gs_jax.apps.benchmark import skip_reason
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import psf_of_depth

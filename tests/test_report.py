@@ -16,7 +16,7 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.__main__ import main
 from gs_jax.apps import drawings
 from gs_jax.apps.drawings import line_chart
-from gs_jax.apps.pictures import downsample, make_slices
+from gs_jax.apps.pictures import make_slices
 from gs_jax.apps.report import SLICE_BYTES, strip_folders, tolerance_section, voxel_view, write_report
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import search_report
@@ -314,10 +314,3 @@ def test_charts_draw_what_is_finite():
     drawn = chart([1.0, 2.0, 3.0], [1.0, None, 3.0])
     assert drawn.count("<polyline") == 1 and "a &lt;b&gt;" in drawn and "no finite number" in chart([1.0], [None])
     assert not any("nan" in each for each in (drawn, chart([1.0], [2.0]), chart([1.0], [2.0], log=True)))
-
-
-@pytest.mark.integration
-def test_downsampled_pixels_are_means_of_blocks():
-    image = np.arange(36.0).reshape(6, 6)
-    np.testing.assert_allclose(downsample(image, 3), image.reshape(3, 2, 3, 2).mean((1, 3)))
-    assert downsample(np.ones((1, 9)), 3).shape == (1, 3)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from gs_jax.apps.training import simulate_unrolled_examples
-from gs_jax.apps.training_data import SCENES
-from gs_jax.apps.training_slices import simulate_stacks
+from gs_jax.apps.training_data import SCENES, simulate_stacks
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.pareto import as_json, trade_off
 from gs_jax.codesign.search import run_study

@@ -4,8 +4,8 @@ import dataclasses
 import json
 import tomllib
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
@@ -14,21 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
-from gs_jax.apps.device_model import (
-    CONSTANT,
-    ERROR_FIELDS,
-    depth_arguments,
-    depth_errors,
-    lens_squares,
-    log_sharpness,
-    make_problem,
-    measure_devices,
-    no_errors,
-    perturb,
-    sample_errors,
-    standard_deviations,
-    step_squares,
-)
+from gs_jax.apps import device_model
+from gs_jax.apps.device_model import CONSTANT, ERROR_FIELDS, make_problem, measure_devices, no_errors
 from gs_jax.apps.report import tolerance_section
 from gs_jax.apps.tolerance_spec import ToleranceSpec, read_tolerances
 from gs_jax.apps.tolerances import (
@@ -48,8 +35,22 @@ from gs_jax.objectives.conditions import field_heights
 from gs_jax.optics import theory
 from gs_jax.optics.diffraction import axial_strehl, strehl
 from gs_jax.optics.pupil import pupil_quadrature
+from gs_jax.optics.raytrace import to_numpy
 
 from .test_cli import run
+
+depth_errors = jax.jit(device_model.depth_errors)
+log_sharpness = eqx.filter_jit(device_model.log_sharpness)
+lens_squares, step_squares = jax.jit(device_model.lens_squares), jax.jit(device_model.step_squares)
+both_strehls = jax.jit(
+    lambda imager, depth: (axial_strehl(imager, depth, radius=0.17), strehl(imager, depth, radius=0.17))
+)
+
+
+@eqx.filter_jit
+def sampled(seed, lenses: int, spec: ToleranceSpec) -> device_model.Errors:
+    return device_model.sample_errors(jax.random.key(seed), lenses, device_model.standard_deviations(spec))
+
 
 DEPTHS = (18.0, 20.0, 23.0)
 DESIGN = """
@@ -94,9 +95,9 @@ def outcome(design) -> Outcome:
 @pytest.fixture(scope="module")
 def pinholes(design):
     """Arguments of `depth_errors` for lenses whose cores are on their chief rays, which have closed forms."""
-    imager, cores, sources, points = depth_arguments(design.imager(), np.array(DEPTHS))
-    zero = cores.offsets._replace(offset=0 * cores.offsets.offset, slopes={})
-    return imager, cores._replace(offsets=zero, slopes=0 * cores.slopes), sources, points
+    imager, cores, sources, points = device_model.depth_arguments(design.imager(), np.array(DEPTHS))
+    zero = cores.offsets._replace(offset=np.zeros(cores.offsets.offset.shape), slopes={})
+    return imager, cores._replace(offsets=zero, slopes=np.zeros(cores.slopes.shape)), sources, points
 
 
 def single(**lens) -> Imager:
@@ -136,15 +137,13 @@ def test_steps_of_a_lens_are_in_its_middle():
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("orientation", ["plano", "curved"])
-def test_the_strehl_ratio_of_a_line_of_rays_is_that_of_all(orientation):
-    imager = single(orientation=orientation)
-    if orientation == "curved":
-        imager = dataclasses.replace(imager, sensor_distance=3.1)
+@pytest.mark.parametrize("orientation, distance", [("plano", 3.8), ("curved", 3.1)])
+def test_the_strehl_ratio_of_a_line_of_rays_is_that_of_all(orientation, distance):
+    imager = dataclasses.replace(single(orientation=orientation), sensor_distance=distance)
     for depth in (16.0, 20.0, 26.0):
-        found = axial_strehl(imager, depth, radius=0.17)
-        np.testing.assert_allclose(found, strehl(imager, depth, radius=0.17), atol=3e-4)
-    check_grads(lambda v: axial_strehl(dataclasses.replace(imager, sensor_distance=v), 18.0), (3.7,), 1, rtol=1e-4)
+        np.testing.assert_allclose(*both_strehls(imager, depth), atol=3e-4)
+    line = jax.jit(lambda v: both_strehls(dataclasses.replace(imager, sensor_distance=v), 18.0)[0])
+    check_grads(line, (3.7,), 1, rtol=1e-4)
 
 
 @pytest.mark.integration
@@ -153,10 +152,10 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
     """Radius, conic, index and distance wrong at once, 3 standard deviations of the defaults and more."""
     pytest.importorskip("optiland")
     nominal = single(), Conditions(DEPTHS, 0.01)
-    deviations = standard_deviations(ToleranceSpec(layer_um=0, roughness_nm=0, tilt_deg=0, position_um=0))
-    errors = jax.tree.map(lambda x: 3 * x, sample_errors(jax.random.key(seed), 1, deviations))
-    width, ratio = map(np.exp, log_sharpness(*nominal, errors, jnp.array(0.005)))
-    imager = perturb(nominal[0], errors)
+    spec = ToleranceSpec(layer_um=0, roughness_nm=0, tilt_deg=0, position_um=0)
+    errors = jax.tree.map(lambda x: np.asarray(3 * np.asarray(x)), sampled(seed, 1, spec))
+    width, ratio = map(np.exp, log_sharpness(*nominal, errors, np.array(0.005)))
+    imager = to_numpy(device_model.perturb(nominal[0], errors))
     points, weights = map(np.asarray, pupil_quadrature(0.2))
     airy = float(theory.airy_sigma(imager.wavelength, imager.sensor_distance, 0.4))
     sag, v = np.asarray(imager.array.sag((points**2).sum(1))), float(imager.sensor_distance)
@@ -180,14 +179,15 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
 @pytest.mark.integration
 def test_wrong_distances_and_indices_have_closed_forms(design, pinholes):
     """`M = v/z'` is what is seen, whatever made it: `-z' dv / (v + dv)`, and the plate's `t/n`."""
-    nothing, n, v = no_errors(len(design.array.centers_mm)), 1.43, 3.8
+    n, v = 1.43, 3.8
     reduced = np.asarray(pinholes[3].points)[:, 2] + 1 / n
-    farther, after = depth_errors(*pinholes, errors=dataclasses.replace(nothing, sensor_distance=jnp.array(0.05)))
+    changed = lambda **change: dataclasses.replace(no_errors(len(design.array.centers_mm)), **change)
+    farther, after = depth_errors(*pinholes, errors=changed(sensor_distance=np.array(0.05)))
     np.testing.assert_allclose(farther, -reduced * 0.05 / (v + 0.05), rtol=1e-6)
     np.testing.assert_allclose(after, 0, atol=1e-9)
-    denser, _ = depth_errors(*pinholes, errors=dataclasses.replace(nothing, index=jnp.array(0.01)))
+    denser, _ = depth_errors(*pinholes, errors=changed(index=np.array(0.01)))
     np.testing.assert_allclose(denser, 1 / (n + 0.01) - 1 / n, rtol=1e-6)
-    leaning, after = depth_errors(*pinholes, errors=dataclasses.replace(nothing, tilt=jnp.array([0.01, -0.004])))
+    leaning, after = depth_errors(*pinholes, errors=changed(tilt=np.array([0.01, -0.004])))
     assert np.abs(leaning).max() > 0.05
     np.testing.assert_allclose(after, 0, atol=1e-9)
 
@@ -213,8 +213,7 @@ def lines(centers, point, v, tilt, rotation, shift, plate) -> np.ndarray:
 def test_depths_by_scipys_fits(design, pinholes, seed):
     """The device's spots, the calibration and the points by straight lines and SciPy; nothing of ours."""
     centers, nominal = np.array(design.array.centers_mm), design.imager()
-    deviations = standard_deviations(ToleranceSpec(radius_percent=0, conic=0))
-    errors = sample_errors(jax.random.key(seed), len(centers), deviations)
+    errors = sampled(seed, len(centers), ToleranceSpec(radius_percent=0, conic=0))
     v, plate = 3.8 + float(errors.sensor_distance), 1 / (1.43 + float(errors.index))
     wrong, tilt = centers + np.asarray(errors.centers), np.asarray(errors.tilt)
     tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "x_scale": "jac"}
@@ -240,15 +239,15 @@ def test_depths_by_scipys_fits(design, pinholes, seed):
 
 @pytest.mark.integration
 def test_gradients_are_finite_differences(design, outcome):
-    deviations, nothing = standard_deviations(outcome.tolerances), no_errors(len(design.array.centers_mm))
-    fields = ["radius", "conic", "index", "sensor_distance"]
-    ends = [dataclasses.replace(nothing, **{f: s * 0.01 * getattr(deviations, f)}) for f in fields for s in (1, -1)]
-    problem = make_problem(design, np.array(DEPTHS))
-    found = measure_devices(problem, jax.tree.map(lambda *parts: jnp.stack(parts), *ends))
-    names = {field: name for name, field in ERROR_FIELDS.items()}
-    for row, field in enumerate(fields):
-        for part, by_gradient in zip(found, outcome.alone[names[field]], strict=True):
-            slope = np.abs(part[2 * row] - part[2 * row + 1]) / 0.02
+    deviations = device_model.standard_deviations(outcome.tolerances)
+    nothing, names = no_errors(len(design.array.centers_mm)), ["radius", "conic", "index", "sensor distance"]
+    change = lambda field, sign: {field: np.asarray(sign * 0.01 * np.asarray(getattr(deviations, field)))}
+    ends = [dataclasses.replace(nothing, **change(ERROR_FIELDS[name], sign)) for name in names for sign in (1, -1)]
+    stacked = jax.tree.map(lambda *values: np.stack(values), *ends)
+    measures = measure_devices(make_problem(design, np.array(DEPTHS)), stacked)
+    for row, name in enumerate(names):
+        for values, by_gradient in zip(measures, outcome.alone[name], strict=True):
+            slope = np.abs(values[2 * row] - values[2 * row + 1]) / 0.02
             np.testing.assert_allclose(slope, by_gradient, rtol=1e-3, atol=1e-6)
 
 
@@ -348,7 +347,7 @@ def test_designs_that_have_no_answer(design):
         tolerance(design, draws=0)
 
 
-def test_files_and_options_say_the_same(folder):
+def test_files_and_options_agree(folder):
     (folder / "all.toml").write_text("\n".join(f"{k} = {v}" for k, v in ToleranceSpec().model_dump().items()))
     assert read_tolerances("all.toml") == ToleranceSpec()
     options = {param.name for param in command.params}

@@ -6,11 +6,11 @@ import optax
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.apps import training_data as simulated_captures, training_slices
+from gs_jax.apps import training_data
 from gs_jax.apps.training import Recipe, init, read_checkpoint, slices_loss, train, write_checkpoint
-from gs_jax.apps.training_data import CaptureSpec
-from gs_jax.apps.training_slices import (
+from gs_jax.apps.training_data import (
     SPECS,
+    CaptureSpec,
     Stack,
     _path,
     sample_paper_batch,
@@ -95,21 +95,21 @@ def test_the_papers_slices(monkeypatch):
     shape = (truth[number] > 0) & (truth[number - 1 if number else 1] == 0)
     assert beside[shape].mean() > beside[truth[number] == 0].mean()
     assert 0 <= truth.min() and truth.max() <= 1
-    monkeypatch.setattr(training_slices, "draw_objects", lambda size, *_: np.zeros((size, size), np.float32))
+    monkeypatch.setattr(training_data, "draw_objects", lambda size, *_: np.zeros((size, size), np.float32))
     empty = sample_paper_batch(np.random.default_rng(0), 16)
     assert np.isfinite(empty.slices).all() and not empty.truth.any()
 
 
-@pytest.mark.parametrize("kind", simulated_captures._DRAW)
+@pytest.mark.parametrize("kind", training_data._DRAW)
 def test_every_kind_of_object_is_drawn(kind):
-    plane = simulated_captures.draw_objects(120, np.random.default_rng(3), 20, (kind,))
+    plane = training_data.draw_objects(120, np.random.default_rng(3), 20, (kind,))
     assert plane.shape == (120, 120) and 0 < np.count_nonzero(plane) < plane.size
     assert plane.min() == 0 and plane.max() <= 10
 
 
 def test_a_sheet_is_shared_out_to_the_planes():
     page = np.ones((60, 60), np.float32)
-    sheets = [simulated_captures.lay_on_sheet(page, np.random.default_rng(seed)) for seed in range(8)]
+    sheets = [training_data.lay_on_sheet(page, np.random.default_rng(seed)) for seed in range(8)]
     for scene in sheets:
         np.testing.assert_allclose(scene.sum(0), page, rtol=1e-6)
         assert np.count_nonzero(scene.sum((1, 2))) >= 2
@@ -120,7 +120,7 @@ def test_a_sheet_is_shared_out_to_the_planes():
 def test_the_truth_lies_where_the_scene_does():
     scene = np.zeros((2, 8, 6), np.float32)
     scene[0, 2:4, 4:6] = 1
-    found = simulated_captures.resample_scene(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
+    found = training_data.resample_scene(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
     expected = np.zeros((3, 4, 3))
     expected[1:, 1, 2] = 0.75, 0.25
     np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -41,7 +41,7 @@ CALLS = {
 # What reads and writes text in the machine's own encoding unless told, and the place of `encoding`.
 TEXT = {"read_text": 0, "write_text": 1, "open": None}
 # Where the system is asked which it is before.
-LINUX = {"base/machine.py", "apps/method_benchmark.py"}
+LINUX = {"base/machine.py", "apps/benchmark.py"}
 
 
 def portable(path: Path) -> list[str]:

@@ -259,13 +259,17 @@ def depth_arguments(
     return imager, cores, _visible(imager, sources), _visible(imager, points)
 
 
-def _visible(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> VisiblePoints:
-    """With the lenses within the field radius of each point whose image is on the sensor."""
+def lenses_that_see(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> Bool[np.ndarray, "lens point"]:
+    """Whether a point is within the field radius of a lens, and its image on the sensor."""
     views = to_numpy(imager).views_of_all(points)
-    spots = views.spot.transpose(1, 0, 2)
     left, right, bottom, top = imager.sensor.extent
-    on_sensor = (spots > (left, top)).all(-1) & (spots < (right, bottom)).all(-1)
-    seen = (np.hypot(*views.offset.T) < imager.field_radius) & on_sensor
+    on_sensor = (views.spot >= (left, top)) & (views.spot <= (right, bottom))
+    return on_sensor.all(-1) & ((views.offset**2).sum(-1) <= imager.field_radius**2)
+
+
+def _visible(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> VisiblePoints:
+    """With the lenses that see each point."""
+    seen = lenses_that_see(imager, points).T
     count = seen.sum(1)
     if count.min() < _MIN_LENSES:
         x, y, z = points[count.argmin()]

@@ -6,6 +6,7 @@ Charts and layouts take under a millisecond, so that `gs-jax explore` draws them
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,6 +26,7 @@ from ..mold.lenslets import Part
 from ..optics import theory
 from ..optics.psf import least_samples, spot_image
 from ..optics.raytrace import to_numpy
+from .device_model import lenses_that_see
 from .pictures import round_length
 
 # Left, right, top and bottom of a chart's axes in its 440 x 290 pixels, and line styles to tell lines without colours.
@@ -49,9 +51,8 @@ def _macros() -> Any:
         import jinja2
 
     text = (resources.files("gs_jax") / "apps" / "templates" / "drawings.html").read_text("utf-8")
-    return (
-        jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(text).module
-    )
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    return environment.from_string(text).module
 
 
 def line_chart(
@@ -152,11 +153,9 @@ class _Face(NamedTuple):
 
 
 def _faces(slabs: Sequence[tuple[Any, Any]]) -> list[_Face]:
-    faces = [_Face(0.0, 0.0)]
-    for thickness, index in slabs:
-        at, reduced = faces[-1]
-        faces.append(_Face(at + float(thickness), reduced + float(thickness) / float(index)))
-    return faces
+    thickness, index = np.array(slabs, float).reshape(-1, 2).T
+    edges = (np.concatenate([[0.0], np.cumsum(size)]).tolist() for size in (thickness, thickness / index))
+    return list(map(_Face, *edges))
 
 
 def _slabs(imager: Imager) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
@@ -165,22 +164,23 @@ def _slabs(imager: Imager) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]
 
 
 def _layers(design: Design, imager: Imager, end: float, far: float) -> list[tuple[float, float, str]]:
-    """Begin and end of each layer that is not air, along the drawing, and what it is."""
+    """Begin and end of each layer that is not air, along the drawing, and its label."""
     front, behind = _slabs(imager)
     on_array, cover = design.layers.object, default_sample(design).layers
-    names = [each.name for each in on_array] + [""] * (len(front) - len(on_array) - len(cover))
-    names += [each.name for each in cover]
-    faces, found = _faces(front), []
-    for k, ((thickness, index), name) in enumerate(zip(front, names, strict=True)):
-        found.append((-faces[k + 1].at, -faces[k].at, _label(name or "layer", index, thickness), float(index)))
-    if imager.sample is not None and faces[-1].at < far:
+    gap = [""] * (len(front) - len(on_array) - len(cover))
+    names = [*(layer.name for layer in on_array), *gap, *(layer.name for layer in cover)]
+    # From the array's front to the left, and from the sensor to the left.
+    sides = ((front, names, 0.0), (behind, [layer.name for layer in design.layers.sensor], end))
+    layers = [
+        (start - beyond.at, start - face.at, _label(name or "layer", index, thickness), float(index))
+        for slabs, labels, start in sides
+        for (thickness, index), name, (face, beyond) in zip(slabs, labels, pairwise(_faces(slabs)), strict=True)
+    ]
+    begins = _faces(front)[-1].at
+    if imager.sample is not None and begins < far:
         index = imager.sample.refractive_index
-        found.append((-far, -faces[-1].at, _label("sample", index), float(index)))
-    faces = _faces(behind)
-    for k, ((thickness, index), table) in enumerate(zip(behind, design.layers.sensor, strict=True)):
-        label = _label(table.name or "layer", index, thickness)
-        found.append((end - faces[k + 1].at, end - faces[k].at, label, float(index)))
-    return [(start, stop, label) for start, stop, label, index in found if index > 1]
+        layers.append((-far, -begins, _label("sample", index), float(index)))
+    return [(start, stop, label) for start, stop, label, index in layers if index > 1]
 
 
 def _label(name: str, index: Any, thickness: Any = None) -> str:
@@ -224,25 +224,17 @@ class LensCounts(NamedTuple):
 
 
 def count_lenses(imager: Imager, depth: float) -> LensCounts:
-    """Counts lenses within the field radius whose chief ray lands on the sensor, at a depth over plate and sensor."""
-    x_left, x_right, y_bottom, y_top = imager.sensor.extent
-    box = plate_and_sensor(imager)
-    step = max(box[2] - box[0], box[3] - box[1]) / _MAP_PIXELS
-    columns, rows = (max(round((high - low) / step), 1) for low, high in ((box[0], box[2]), (box[1], box[3])))
-    x = box[0] + (np.arange(columns) + 0.5) * (box[2] - box[0]) / columns
-    y = box[1] + (np.arange(rows) + 0.5) * (box[3] - box[1]) / rows
-    points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    count = np.empty(len(points), int)
-    host = to_numpy(imager)
-    for start in range(0, len(points), _BATCH):
-        batch = points[start : start + _BATCH]
-        views = host.views_of_all(np.column_stack([batch, np.full(len(batch), depth)]))
-        seen = (views.spot[..., 0] >= x_left) & (views.spot[..., 0] <= x_right)
-        seen &= (views.spot[..., 1] >= y_top) & (views.spot[..., 1] <= y_bottom)
-        seen &= (views.offset**2).sum(-1) <= imager.field_radius**2
-        count[start : start + _BATCH] = seen.sum(0)
-    over_plate = MatplotlibPath(plate_corners(imager)).contains_points(points)
-    return LensCounts(count.reshape(rows, columns), box, float(count[over_plate].mean()))
+    """Count lenses within the field radius whose chief ray lands on the sensor, at a depth over plate and sensor."""
+    left, top, right, bottom = box = plate_and_sensor(imager)
+    step = max(right - left, bottom - top) / _MAP_PIXELS
+    columns, rows = (max(round(length / step), 1) for length in (right - left, bottom - top))
+    x = left + (np.arange(columns) + 0.5) * (right - left) / columns
+    y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
+    points = np.stack([*np.meshgrid(x, y), np.full((rows, columns), depth)], -1).reshape(-1, 3)
+    batches = range(0, len(points), _BATCH)
+    counts = np.concatenate([lenses_that_see(imager, points[at : at + _BATCH]).sum(0) for at in batches])
+    over_plate = MatplotlibPath(plate_corners(imager)).contains_points(points[:, :2])
+    return LensCounts(counts.reshape(rows, columns), box, float(counts[over_plate].mean()))
 
 
 def draw_layout(imager: Imager, picture: str, box: tuple[float, float, float, float], what: str) -> str:
@@ -259,7 +251,7 @@ def _outlines(imager: Imager) -> str:
     """Discs cut at the edges of their Voronoi cells, where calibration places them on the sensor."""
     array = imager.array
     centers = np.asarray(array.centers, float)
-    angles = np.linspace(0, 2 * np.pi, max(6, min(48, _OUTLINE_POINTS // len(centers))), endpoint=False)
+    angles = np.linspace(0, 2 * np.pi, int(np.clip(_OUTLINE_POINTS // len(centers), 6, 48)), endpoint=False)
     direction = np.column_stack([np.cos(angles), np.sin(angles)])
     radius = np.repeat(np.asarray(array.of_lenses("aperture_diameter"), float)[:, None] / 2, len(angles), 1)
     edges = cell_edges(centers, array.plate)

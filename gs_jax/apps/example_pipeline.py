@@ -9,6 +9,8 @@ from time import perf_counter
 import jax
 import numpy as np
 from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
@@ -32,31 +34,38 @@ from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
 from ..simulation.phantoms import letters, random_points, rasterize
 from ..simulation.synthetic import Camera, expose, simulate
+from ..solvers.admm import ADMM
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.unrolled import Unrolled
 from ..typing import PathLike
+from .pictures import downsample, draw_image
 from .report import write_report
 
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
-_DEPTHS = np.arange(17.0, 23.01, 0.5)
-_VOXEL_MM = 0.0415
+# Voxels of the words: each step of a solver costs a hundred back-projections.
+_WORD_DEPTHS, _WORD_VOXEL_MM = (18.0, 19.0, 20.0, 21.0, 22.0), 0.083
+_STEPS = 8
+# Voxels in which points are found.
+_POINT_DEPTHS, _POINT_VOXEL_MM = np.arange(17.0, 23.01, 0.5), 0.0415
 _POINTS = 60
 _PEAK_ELECTRONS = 10_000
-# Richardson-Lucy uses every second plane and few steps: each costs a hundred back-projections.
-_COARSE, _STEPS = slice(None, None, 2), 8
 # Depth, text and centre of each word, and the height of its capitals, mm.
 WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))
 _WORD_HEIGHT = 2.5
+# In the picture: part of the field with words, half of it, mm; pixels of the capture's middle; colours of the depths.
+_SHOWN_MM, _MIDDLE, _COLOURS = 8.6, 900, ("#3d8bff", "#ffe45c", "#ff4538")
+_TRUTH, _BEST = "truth", "unrolled inversion"
 # Sentences of the page.
 _NOTES = {
     "page": "By gs-jax demo, from simulated captures; report.md has the scores, the optimised design and the times.",
     "capture": "words.tif: three words at 18, 20 and 22 mm, simulated with noise.",
-    "volume": "words.ome.tif: back-projection, then the network that suppresses the background.",
+    "volume": f"words.ome.tif: the {_BEST}.",
     "points": "points-found.csv: found in points.tif, another capture.",
 }
 
 
 def run(folder: PathLike, progress: Progress | None = None) -> Path:
-    """Runs the pipeline and writes a folder: designs, captures, volume, points, mold, pictures, reports.
+    """Run the pipeline and write a folder: designs, captures, volume, points, mold, pictures, reports.
 
     Returns
     -------
@@ -105,7 +114,7 @@ def _template(name: str) -> str:
 
 
 def _optimise(folder: Path, progress: Progress) -> list[dict]:
-    """Optimises the design as the paper prints it, out of focus, for the targets of the paper."""
+    """Optimise the design as the paper prints it, out of focus, for the targets of the paper."""
     write_text(folder / "study.toml", _template("example_study.toml"), [".toml"])
     printed = geomscope(sensor_distance_mm=4.0)
     write_design(folder / "printed.toml", printed)
@@ -121,37 +130,35 @@ def words(pitch: float) -> Float[np.ndarray, "emitter 4"]:
 
 
 def _image_words(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[dict[str, Quality], dict]:
-    """Reconstructs words at three depths in three ways; returns scores, and what the page shows."""
-    imager, depths = design.imager(), [z for z, _, _ in WORDS]
-    scene_grid = Grid.over(imager.sensor, depths=depths, pitch=_SCENE_MM)
+    """Reconstruct words at three depths by several methods; return scores, and the contents of the page."""
+    imager = design.imager()
+    scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
+    grid = Grid.over(imager.sensor, depths=_WORD_DEPTHS, pitch=_WORD_VOXEL_MM)
     emitters = words(_SCENE_MM)
-    scene = np.asarray(rasterize(emitters, scene_grid))
-    grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)
-    coarse = grid.at(grid.depths[_COARSE])
     with _timed(seconds, "simulating words"):
-        light = simulate(scene, imager, scene_grid, progress=progress)
+        light = simulate(np.asarray(rasterize(emitters, scene_grid)), imager, scene_grid, progress=progress)
         image = _expose(light, folder / "words.tif", seed=0)
-    with _timed(seconds, "back-projection, compiled first"):
-        plain = reconstruct(image, imager, grid, progress=progress)
-    with progress.step("Suppressing the background"), _timed(seconds, "U-Net"):
-        clean = suppress(plain, pretrained())
-        write_volume(folder / "words.ome.tif", clean, grid)
-    with _timed(seconds, "Richardson-Lucy"):
-        iterated = reconstruct(image, imager, coarse, RichardsonLucy(_STEPS, accelerate=True), progress=progress)
     # Blurred by a voxel, so that shifts by parts of a voxel are not counted as errors.
-    truth = gaussian_filter(np.asarray(rasterize(emitters, coarse)), (0, 1, 1))
-    volumes = {
-        "back-projection": plain[_COARSE],
-        "back-projection + U-Net": clean[_COARSE],
-        f"Richardson-Lucy, {_STEPS} steps": iterated,
+    volumes = {_TRUTH: gaussian_filter(np.asarray(rasterize(emitters, grid)), (0, 1, 1))}
+    with _timed(seconds, "back-projection"):
+        volumes["back-projection"] = plain = reconstruct(image, imager, grid, progress=progress)
+    with progress.step("Suppressing the background"), _timed(seconds, "U-Net"):
+        volumes["back-projection + U-Net"] = suppress(plain, pretrained())
+    solvers = {
+        f"Richardson-Lucy, {_STEPS} steps": RichardsonLucy(_STEPS, accelerate=True),
+        f"ADMM, {_STEPS} steps": ADMM(_STEPS),
+        _BEST: Unrolled.pretrained(),
     }
+    for name, solver in solvers.items():
+        with _timed(seconds, name):
+            volumes[name] = reconstruct(image, imager, grid, solver, progress=progress)
+    write_volume(folder / "words.ome.tif", volumes[_BEST], grid)
+    truth = volumes[_TRUTH]
     scores = {"nothing (all zero)": quality(np.zeros_like(truth), truth)}
-    scores |= {name: quality(volume, truth) for name, volume in volumes.items()}
-    planes = [int(np.abs(np.asarray(coarse.depths) - z).argmin()) for z in depths]
+    scores |= {name: quality(volume, truth) for name, volume in volumes.items() if name != _TRUTH}
     with progress.step("Drawing"):
-        shown = {name: volume[planes] for name, volume in ({"truth": truth} | volumes).items()}
-        write_figure(folder / "words.png", _draw_words(image, depths, shown, imager.sensor))
-    return scores, {"image": image, "volume": clean, "grid": grid}
+        write_figure(folder / "words.png", _draw_words(image, imager.sensor, volumes, scores, grid))
+    return scores, {"image": image, "volume": volumes[_BEST], "grid": grid}
 
 
 def _image_points(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[np.ndarray, Localization]:
@@ -161,7 +168,7 @@ def _image_points(folder: Path, design: Design, seconds: dict, progress: Progres
         light = simulate(truth, imager, progress=progress)
         image = _expose(light, folder / "points.tif", seed=1)
     with _timed(seconds, "finding points"):
-        grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)
+        grid = Grid.over(imager.sensor, depths=_POINT_DEPTHS, pitch=_POINT_VOXEL_MM)
         found = find_points(image, imager, grid, progress=progress)
     write_points(folder / "points-truth.csv", truth)
     write_points(folder / "points-found.csv", found)
@@ -183,27 +190,33 @@ def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
     seconds[step] = perf_counter() - started
 
 
-def _draw_words(image: np.ndarray, depths: list[float], volumes: dict[str, np.ndarray], sensor: Sensor) -> Figure:
-    """The capture and its middle, and beside them a row per volume and a column per depth."""
-    count = len(depths)
-    figure = Figure(figsize=(3.1 * (count + 1) + 0.8, 2.9 * len(volumes)), dpi=110, layout="constrained")
-    left, right = np.ravel(np.asarray(figure.subfigures(1, 2, width_ratios=(1.25, count))))
-    step = max(1, image.shape[0] // 1024)
-    crop = image[tuple(slice(n // 2 - 400, n // 2 + 400) for n in image.shape)]
-    captures = (image[::step, ::step], sensor, "capture"), (crop, Sensor(crop.shape, sensor.pixel_pitch), "its middle")
-    for axes, (part, area, title) in zip(left.subplots(2, 1), captures, strict=True):
-        axes.imshow(part, cmap="gray", extent=area.extent, vmax=np.percentile(part, 99.8))
-        axes.set(title=title, xlabel="x, mm", ylabel="y, mm")
-    grid = right.subplots(len(volumes), count, sharex=True, sharey=True, squeeze=False)
-    for row, (name, volume) in zip(grid, volumes.items(), strict=True):
-        for axes, depth, plane in zip(row, depths, volume, strict=True):
-            # Back-projection has a pedestal, which is no object.
-            low, high = np.percentile(plane, (50, 99.9))
-            axes.imshow(plane, cmap="magma", extent=sensor.extent, vmin=low, vmax=max(high, low + 1e-9))
-            axes.set_title(f"{name}, {depth:g} mm")
-        row[0].set_ylabel("y, mm")
-    for axes in grid[-1]:
-        axes.set_xlabel("x, mm")
+def _draw_words(
+    image: np.ndarray, sensor: Sensor, volumes: dict[str, np.ndarray], scores: dict[str, Quality], grid: Grid
+) -> Figure:
+    """The capture and its middle, and maxima of volumes along z with a colour for each depth."""
+    figure = Figure(figsize=(14, 7.4), dpi=100, layout="constrained")
+    axes = figure.subplots(2, 4)
+    middle = image[tuple(slice((n - _MIDDLE) // 2, (n + _MIDDLE) // 2) for n in image.shape)]
+    captures = {
+        f"capture, {image.size / 1e6:.0f} megapixels": (downsample(image, 1280), sensor),
+        "middle of the capture": (middle, Sensor(middle.shape, sensor.pixel_pitch)),
+    }
+    for axis, (title, (pixels, area)) in zip(axes[:, 0], captures.items(), strict=True):
+        low, high = np.percentile(pixels, (1, 99.8))
+        draw_image(axis, pixels, area.extent, low=low, high=high, cmap="gray")
+        axis.set_title(title, fontsize=13)
+    depth_range, colours = Normalize(*grid.depths[[0, -1]]), LinearSegmentedColormap.from_list("depths", _COLOURS)
+    rows, columns = (abs(np.asarray(along)) < _SHOWN_MM for along in (grid.y, grid.x))
+    for axis, (name, volume) in zip((*axes[0, 1:], *axes[1, 1:]), volumes.items(), strict=True):
+        # Back-projection has a pedestal, which is no object.
+        light = (volume - np.median(volume, (1, 2), keepdims=True))[:, rows][..., columns]
+        share = np.clip(light / max(np.percentile(light.max(0), 99.7), 1e-30), 0, 1)
+        shown = (share[..., None] * np.array(colours(depth_range(grid.depths)))[:, None, None, :3]).max(0)
+        draw_image(axis, shown, (-_SHOWN_MM, _SHOWN_MM, _SHOWN_MM, -_SHOWN_MM))
+        axis.set_title(f"{name}\n{scores[name].psnr_db:.1f} dB PSNR" if name in scores else name, fontsize=13)
+    bar = figure.colorbar(ScalarMappable(depth_range, colours), ax=axes[:, 3], ticks=[z for z, _, _ in WORDS])
+    bar.set_label("depth z, mm", fontsize=13)
+    bar.ax.tick_params(labelsize=12)
     return figure
 
 

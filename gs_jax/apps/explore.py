@@ -32,11 +32,12 @@ from .explore_design import (
     find_violations,
     live_terms,
     make_sliders,
+    map_ghosts,
     moved_design,
     moved_imager,
+    reconstruct_points,
     start_of,
 )
-from .explore_preview import map_ghosts, reconstruct_points
 from .pictures import png_uri, to_uint8
 from .report import render
 

@@ -34,7 +34,7 @@ from ..reconstruction.residual import kept_pixels_of_folds
 from ..solvers.base import run_solver
 from ..solvers.unrolled import State as UnrolledState, Unrolled
 from ..typing import Image
-from .training import Recipe, State, init, run_fixed_steps, train, unroll
+from .training import Recipe, State, in_unit_of_mean, init, run_fixed_steps, train, unroll
 
 # Captures at the least, and the share of them that is held out.
 _LEAST, _HELD_OUT = 3, 4
@@ -112,7 +112,14 @@ def fine_tune(
     progress = progress or Progress()
     trained, held_out, scored = _split(images, imager, grid, networks, optics, seed, progress)
     loss = eqx.filter_jit(prediction_loss)
-    mean_loss = lambda networks: float(np.mean([loss(networks, each) for each in held_out]))
+
+    def mean_loss(networks: Unrolled) -> float:
+        return float(np.mean([loss(networks, capture) for capture in held_out]))
+
+    def error(networks: Unrolled, captures: list[SplitCapture]) -> float:
+        """After all steps, also those without networks."""
+        return float(np.mean([_error_of_all_steps(networks, capture, progress) for capture in captures]))
+
     recipe = Recipe(lambda key: networks, _optimizer, lambda rng: trained[rng.integers(len(trained))], prediction_loss)
     history, best = [(0, mean_loss(networks))], networks
     with progress.counter("Training", steps) as advance:
@@ -122,25 +129,21 @@ def fine_tune(
             advance()
             if int(state.step) % _EVERY and int(state.step) < steps:
                 return False
-            found = mean_loss(state.network)
-            if found < min(each for _, each in history):
+            value = mean_loss(state.network)
+            if value < min(value for _, value in history):
                 best = state.network
                 on_better(best)
-            history.append((int(state.step), found))
-            return int(np.argmin([each for _, each in history])) < len(history) - _PATIENCE
+            history.append((int(state.step), value))
+            return int(np.argmin([value for _, value in history])) < len(history) - _PATIENCE
 
         state = train(recipe, init(recipe, steps=steps, seed=seed), callback=callback)
-    whole = lambda networks, captures: float(
-        np.mean([_error_of_all_steps(networks, each, progress) for each in captures])
-    )
     without = dataclasses.replace(best, last=0, steps=best.first + best.power.size)
     # Networks that did not change are scored once.
-    tried = {id(each): each for each in (networks, best, without)}.values()
-    chosen = min(tried, key=lambda each: whole(each, held_out))
-    before = whole(networks, scored)
-    after = before if chosen is networks else whole(chosen, scored)
-    losses = [float(each) for each in state.losses[: int(state.step)]]
-    return FineTuned(chosen, losses, history, before, after)
+    tried = {id(candidate): candidate for candidate in (networks, best, without)}.values()
+    chosen = min(tried, key=lambda candidate: error(candidate, held_out))
+    before = error(networks, scored)
+    after = before if chosen is networks else error(chosen, scored)
+    return FineTuned(chosen, state.losses[: int(state.step)].tolist(), history, before, after)
 
 
 def check_number(captures: Sequence) -> None:
@@ -196,8 +199,7 @@ def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list
     trained, held_out, scored = [], [], []
     for place, number in enumerate(progress.track(order, "First steps")):
         light, background = prepare_data(images[number], model)
-        light = light - background
-        light = light / np.float32(max(float(np.abs(light).mean()), 1e-30))
+        light, _ = in_unit_of_mean(light - background)
         is_held_out = place % _HELD_OUT == 0
         for kept in [folds[place // _HELD_OUT % _FOLDS]] if is_held_out else folds:
             system = dataclasses.replace(model, kept=kept)

@@ -89,7 +89,7 @@ def line_of(method: str) -> dict[str, Any]:
 
 def draw_image(
     axes: Axes,
-    image: Num[np.ndarray, "row column"],
+    image: Num[np.ndarray, "row column *rgb"],
     extent: tuple[float, float, float, float],
     *,
     low: float = 0.0,
@@ -104,7 +104,7 @@ def draw_image(
     axes
         Axes to draw in.
     image
-        Gray values.
+        Gray values, or red, green and blue from 0 to 1.
     extent
         `(left, right, bottom, top)`, mm.
     low, high

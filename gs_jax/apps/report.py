@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Num
 from matplotlib.figure import Figure
+from rich.table import Table
 
 from ..base.errors import InputError, needs_extra
 from ..base.machine import describe
 from ..base.progress import Progress
-from ..design.conversion import NO_SAMPLE, default_sample, object_begins
-from ..design.datasheets import circle_of_confusion_of, datasheet, findings
+from ..design.datasheets import datasheet, findings, overview, path_in_words, summary, tables
 from ..design.design import Design, design_text, span_of
 from ..geometry import Imager
 from ..grid import Grid
@@ -41,31 +41,10 @@ from .pictures import (
     volume_html,
 )
 
-# Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.datasheets`; least Strehl ratio in figures.
-_FAR, _MIN_STREHL = 2.0, 0.01
 SLICE_BYTES = 6_000_000  # of all slices, before compression
 # Voxels in space, in all and along a side; points in space and in the table; pixels along a capture, and of its middle.
 _MAX_VOXELS, _MAX_SIDE, _MAX_POINTS, _LISTED_POINTS, _MAX_CAPTURE, _MIDDLE = 60_000, 200, 5000, 300, 900, 500
 _MAX_COLUMNS = 40_000  # of sheets in space
-# Title, unit and source of the datasheet's rows.
-_ROWS = {
-    "magnification": ("magnification M", "", "Eq. 3"),
-    "scale": ("scale of the pattern", "", "Eq. 1"),
-    "lateral_resolution_um": ("lateral resolution, predicted", "um", "Eq. 5"),
-    "axial_resolution_um": ("axial resolution, predicted", "um", "Eq. 6"),
-    "fwhm_um": ("full width at half maximum of the PSF on the axis, in the object", "um", "diffraction"),
-    "rms_width_um": ("RMS width of the PSF, in the object", "um", "exact rays"),
-    "half_light_radius_um": ("radius of half of the light, in the object", "um", "exact rays"),
-    "spot_radius_um": ("radius of 80 % of the light, in the object", "um", "exact rays"),
-    "blur_um": ("blur of a thin lens on the sensor", "um", ""),
-    "focus_distance_mm": ("image at", "mm", ""),
-    "depth_of_field_mm": ("depth of field, if focused there", "mm", "Eq. 8"),
-    "near_limit_mm": ("from", "mm", "Eq. 8"),
-    "far_limit_mm": ("to", "mm", "Eq. 8"),
-    "strehl_on_axis": ("Strehl ratio on the axis", "", "Eq. 9"),
-    "lenses_per_point": ("lenses that see a point", "", ""),
-    "occupancy": ("occupancy", "", "Eq. 11"),
-}
 
 
 def write_report(
@@ -199,9 +178,10 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     }
     return {
         "sheet": sheet,
-        "sheet_rows": _datasheet_rows(design, sheet),
+        "tables": [_cells(table) for table in tables(sheet)],
         "violations": violations,
-        "device": device_rows(design, sheet),
+        "device": [summary(design, sheet), *overview(design, sheet), *filter(None, [path_in_words(sheet)])],
+        "keys": _device_rows(design),
         "section": section,
         "layout": layout,
         "seen": {"depth": middle, "most": int(counts.lenses.max()), "mean": counts.mean},
@@ -212,6 +192,24 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
         "psfs": _psf_pictures(psfs, imager),
         **_mtf_charts(psfs, imager, diameter),
     }
+
+
+def _device_rows(design: Design) -> list[tuple[str, str]]:
+    """Keys of the design file and their values; of a value per lens the span."""
+    of_sensor, of_lens, of_array, of_imaging = (
+        table.model_dump(exclude_defaults=True, exclude={"centers_mm", "aspheric_terms"})
+        for table in (design.sensor, design.lens, design.array, design.imaging)
+    )
+    of_lens = {key: value if isinstance(value, str) else span_of(value) for key, value in of_lens.items()}
+    rows = {"lenses": len(design.array.centers_mm)} | of_lens | of_array | of_sensor | of_imaging
+    texts = [" x ".join(map(str, value)) if isinstance(value, tuple) else str(value) for value in rows.values()]
+    return [(key.replace("_", " "), text) for key, text in zip(rows, texts, strict=True)]
+
+
+def _cells(table: Table) -> dict[str, Any]:
+    """Title, heads and rows of a table for the terminal."""
+    heads, *columns = [column.header for column in table.columns], *(column.cells for column in table.columns)
+    return {"title": table.title, "heads": heads, "rows": list(zip(*columns, strict=True))}
 
 
 def _psf_pictures(psfs: Psfs, imager: Imager) -> dict[str, Any]:
@@ -243,77 +241,6 @@ def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
         "mtf_depth": chart(by_depth, "On the axis, by depth"),
         "mtf_field": chart(by_field, f"Over the field, at {psfs.depths[sharpest]:.4g} mm"),
     }
-
-
-def _datasheet_rows(design: Design, sheet: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the datasheet by depth; a cell is a text and the assumption that its value violates, or ""."""
-    circle_of_confusion = 1000 * circle_of_confusion_of(design, None)
-
-    def violation(key: str, i: int, value: float | None) -> str:
-        if value is None:
-            return ""
-        if key == "blur_um" and value > circle_of_confusion:
-            return f"out of focus: more than the circle of confusion, {circle_of_confusion:.3g} um"
-        if key == "rms_width_um" and sheet["spot_width_um"][i] > _FAR * sheet["lateral_resolution_um"][i]:
-            return "2.355 times it, as of a Gaussian, is more than twice the prediction of Eq. 5"
-        if key == "occupancy" and value > 1:
-            return "sub-images of an object that fills the field overlap"
-        return ""
-
-    def text(key: str, value: float | None) -> str:
-        is_poor = key == "strehl_on_axis" and value is not None and value < _MIN_STREHL
-        return f"< {_MIN_STREHL:g}" if is_poor else _number(value)
-
-    return [
-        dict(zip(("name", "unit", "source"), titles, strict=True))
-        | {"cells": [(text(key, value), violation(key, i, value)) for i, value in enumerate(sheet[key])]}
-        for key, titles in _ROWS.items()
-    ]
-
-
-def _number(value: float | None) -> str:
-    return "infinite" if value is None else f"{value:.4g}"
-
-
-def device_rows(design: Design, sheet: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Names and values of the main properties of the microscope."""
-    sensor, lens, array, imaging = design.sensor, design.lens, design.array, design.imaging
-    rows, columns = sensor.shape
-    height, width = (f"{n * sensor.pixel_pitch_um / 1000:.4g}" for n in sensor.shape)
-    shape = f"radius {span_of(lens.radius_of_curvature_mm)} mm, index {design.refractive_index:g}"
-    if lens.focal_length_mm is not None:
-        shape = "ideal, thin"
-    conic = f", conic constant {span_of(lens.conic_constant)}" if lens.conic_constant else ""
-    terms = f", {len(lens.aspheric_terms)} aspheric terms" if lens.aspheric_terms else ""
-    return [
-        ("lenses", f"{len(array.centers_mm)} on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm"),
-        ("a lens", f"{shape}{conic}{terms}, {span_of(lens.aperture_diameter_mm)} mm wide"),
-        ("faces the object", f"the lenses' {lens.orientation} side"),
-        ("focal length", f"{_number(sheet['focal_length_mm'])} mm"),
-        ("F-number, NA", f"{_number(sheet['f_number'])}, {_number(sheet['numerical_aperture'])}"),
-        ("pitch", f"{_number(sheet['pitch_mm'])} mm (SD {_number(sheet['pitch_sd_mm'])} mm)"),
-        ("plate", f"{array.substrate_thickness_mm:g} mm thick, {100 * sheet['coverage']:.1f} % covered by lenses"),
-        ("sensor", f"{rows} x {columns} pixels of {sensor.pixel_pitch_um:g} um: {height} x {width} mm"),
-        ("sensor distance", f"{imaging.sensor_distance_mm:g} mm"),
-        *_path_rows(design),
-        ("objects at", f"{imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm"),
-        ("light", f"{imaging.wavelength_nm:g} nm"),
-        ("field radius", f"{imaging.field_radius_mm:g} mm"),
-    ]
-
-
-def _path_rows(design: Design) -> list[tuple[str, str]]:
-    layers, sample = design.layers, default_sample(design)
-    sides = {"on the array": layers.object, "before the object": sample.layers, "on the sensor": layers.sensor}
-
-    def text(layer) -> str:
-        if layer.refractive_index in (1, "air"):
-            return f"{layer.name or 'air'}, {layer.thickness_mm:g} mm"
-        return f"{layer.name or 'layer'}, {layer.thickness_mm:g} mm, n = {layer.refractive_index}"
-
-    rows = [(side, "; ".join(map(text, slabs))) for side, slabs in sides.items() if slabs]
-    medium = "air" if sample == NO_SAMPLE else f"n = {sample.refractive_index} from {object_begins(design):g} mm"
-    return [*rows, ("objects in", medium)]
 
 
 def _calibration(design: Design) -> dict[str, Any]:

@@ -22,8 +22,16 @@ from ..reconstruction.inverse_problem import InverseProblem, lens_type_geometrie
 from ..solvers.base import Operator
 from ..solvers.unrolled import State as UnrolledState, Unrolled, initialize_unrolled
 from ..typing import PathLike, Volume
-from .training_data import SCENES, CaptureSpec, simulate_example, trace_optics
-from .training_slices import Batch, Stack, sample_paper_batch, sample_patches
+from .training_data import (
+    Batch,
+    CaptureSpec,
+    Stack,
+    sample_paper_batch,
+    sample_patches,
+    simulate_example,
+    simulate_groups,
+    trace_optics,
+)
 
 # Captures of the unrolled networks: pixels are sums of 4 x 4, voxels as wide as those by default.
 UNROLLED = CaptureSpec(288, 0.018, 0.064, 7, binning=4)
@@ -188,32 +196,34 @@ def simulate_unrolled_examples(
     workers: Workers | None = None,
 ) -> list[UnrolledExample]:
     """Simulate the first examples of a seed, by workers if there are any."""
-    groups = [range(first, min(first + SCENES, count)) for first in range(0, count, SCENES)]
-    stream, results = (workers or Workers()).mapper(partial(_simulator, seed, spec)), {}
-    with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
-        for group, result in stream(groups):
-            results[group.start] = result()
-            advance()
-    return [example for start in sorted(results) for example in results[start]]
+    examples = {}
+    for group in simulate_groups(partial(_simulator, seed, spec), range(count), progress, workers):
+        examples |= group
+    return [examples[number] for number in range(count)]
 
 
 def _simulator(seed: int, spec: CaptureSpec):
     networks = initialize_unrolled(key=jax.random.key(0))
 
-    def simulate(numbers):
-        examples, optics = [], None
+    def simulate(numbers: list[int]) -> dict[int, UnrolledExample]:
+        examples, optics = {}, None
         for number in numbers:
             image, imager, grid, truth = simulate_example(seed, number, spec)
             # Of the calibrated microscope, which all of these numbers have in common.
             optics = optics or trace_optics(imager, np.asarray(grid.depths, np.float64), spec)
-            light = subtract_offset(image)
-            unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
+            light, unit = in_unit_of_mean(subtract_offset(image))
             system = InverseProblem(imager, grid, optics, lens_type_geometries(imager, grid))
-            start = run_fixed_steps(networks, system, light / unit)
-            examples.append(UnrolledExample(light / unit, system, truth / unit, start))
+            start = run_fixed_steps(networks, system, light)
+            examples[number] = UnrolledExample(light, system, truth / unit, start)
         return examples
 
     return simulate
+
+
+def in_unit_of_mean(light: Float32[np.ndarray, "row column"]) -> tuple[Float32[np.ndarray, "row column"], np.float32]:
+    """Light relative to its mean absolute value, and that mean."""
+    unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
+    return light / unit, unit
 
 
 @eqx.filter_jit

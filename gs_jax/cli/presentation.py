@@ -140,8 +140,7 @@ def demo_command(*, out: Path = Path("gs-jax-demo")):
 @command("benchmark", "Example: gs-jax benchmark --out benchmark")
 def benchmark_command(*, out: Path = Path("gs-jax-benchmark")):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
-    from ..apps.benchmark_report import write, write_records
-    from ..apps.method_benchmark import run
+    from ..apps.benchmark import run, write, write_records
 
     folder = make_folder(out)
     numbers, provenance = folder / "benchmark.json", provenance_of()

@@ -120,7 +120,7 @@ def train_command(
         with_fixed_steps,
         write_checkpoint,
     )
-    from ..apps.training_slices import simulate_stacks
+    from ..apps.training_data import simulate_stacks
     from ..detection.unet import write_weights
     from ..reconstruction.networks import write_unrolled
 

@@ -362,13 +362,13 @@ _LEAST_BETWEEN, _STREHL_DOMAIN = 0.005, 0.1
 def findings(design: Design, sheet: dict[str, Any], *, circle_of_confusion: float | None = None) -> list[str]:
     """Violated assumptions of a design and its datasheet, in short sentences; arguments and errors as `datasheet`."""
     parts = parts_of(design, sheet["depth_mm"], circle_of_confusion=circle_of_confusion)
-    remarks = [_rays(sheet), *_focus(design, sheet, parts, circle_of_confusion_of(design, circle_of_confusion))]
+    remarks = [spots_remark(sheet), *_focus(design, sheet, parts, circle_of_confusion_of(design, circle_of_confusion))]
     if len(parts) == 1:  # each type has its own wavefront error
         remarks += _strehl(design, sheet, *parts[0])
-    return [remark for remark in (*remarks, *_lens_and_plate(design, sheet)) if remark]
+    return [remark for remark in (*remarks, *lens_and_plate_remarks(design, sheet)) if remark]
 
 
-def _rays(sheet: dict[str, Any]) -> str:
+def spots_remark(sheet: dict[str, Any]) -> str:
     """The spots by exact rays, where they are far wider than the formulas promise."""
     wide, promised = np.array(sheet["spot_width_um"]), np.array(sheet["lateral_resolution_um"])
     if not (wide > _FAR * promised).any():
@@ -480,7 +480,7 @@ def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Condition
         )
 
 
-def _lens_and_plate(design: Design, sheet: dict[str, Any]) -> Iterator[str]:
+def lens_and_plate_remarks(design: Design, sheet: dict[str, Any]) -> Iterator[str]:
     """Remarks about pixels, pitch, overlap and the plate between the lenses."""
     aperture, f, pitch = sheet["numerical_aperture"], sheet["focal_length_mm"], sheet["pitch_mm"]
     pixel, spot = design.sensor.pixel_pitch_um, design.imaging.wavelength_nm / 2000 / aperture

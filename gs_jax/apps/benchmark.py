@@ -8,6 +8,7 @@ are matrix-free. Every solver takes the same number of steps, whose cost and pro
 objective that least-squares solvers reach, relative to that of an empty volume.
 """
 
+import csv
 import ctypes
 import dataclasses
 import gc
@@ -27,11 +28,12 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Float32
+from matplotlib.figure import Figure
 from skimage.feature import peak_local_max
 
 from ..base.arrays import to_float32
 from ..base.errors import InputError
-from ..base.machine import available_memory, status_mib
+from ..base.machine import available_memory, describe, status_mib
 from ..base.progress import Progress
 from ..design.start import geomscope
 from ..detection.clusters import find_clusters
@@ -39,6 +41,8 @@ from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
 from ..geometry import Imager
 from ..grid import Grid, Sensor
+from ..io.files import atomic_write, write_figure, write_json, write_text
+from ..io.provenance import KEY, Provenance
 from ..lenses import MicrolensArray
 from ..metrics import localization, quality
 from ..optics.apertures import clear_diameter
@@ -53,6 +57,7 @@ from ..solvers.base import lambda_max, solve
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..typing import Volume
+from .pictures import line_of
 
 # 1e6 to 2e9 pairs as in the paper, then up to its full scale (5120^2 pixels times 4 million voxels: 1e14).
 SIDES = (32, 56, 100, 212, 1024, 3200)
@@ -61,11 +66,25 @@ WIDTH, DEPTH, PARTICLES, PEAK_ELECTRONS = 5.76, 20.0, 10, 10_000.0
 # Points along a side of a particle; part of the largest value that a peak exceeds (particles differ by a factor of 2).
 _ACROSS, _PEAK = 6, 0.3
 COSTS = ("seconds", "compile_seconds", "peak_mib")
+COLUMNS = ("method", "pairs", *COSTS, "psnr_db", "ssim", "mse", "f1", "seed", "objective")
 # Seconds: calls that take longer are not repeated; methods that would take longer are skipped.
 _REPEAT, LIMIT = 1.0, 30.0
 _REPEATS = 5
 
+# Exponents of the time in the text on the paper's Fig. 9(A): linear, and below 0.5.
+_PAPER = {"admm, dense": "1", "richardson-lucy, dense": "1", "backproject": "< 0.5"}
+_STOP = f"Every solver takes {STEPS} steps, converged or not."
+_PANELS = {
+    "seconds": "time, s",
+    "peak_mib": "memory, MiB",
+    "psnr_db": "PSNR, dB",
+    "ssim": "SSIM",
+    "mse": "MSE",
+    "f1": "F1 of the points",
+}
+
 Psf = Float32[np.ndarray, "1 tall wide"]
+Records = Sequence[dict[str, Any]]
 
 
 def make_microscope(side: int) -> tuple[Imager, Grid, Psf]:
@@ -188,9 +207,13 @@ _PLAIN = {
 
 def _matrix_free(name: str):
     method = _PLAIN[name]
-    # Pixel-voxel lists have no PSF.
-    optics = lambda psf: None if isinstance(method, PinholeRichardsonLucy) else psf
-    return lambda imager, grid, psf: lambda image: reconstruct(image, imager, grid, method, optics=optics(psf))
+
+    def make(imager: Imager, grid: Grid, psf: Psf):
+        # Pixel-voxel lists have no PSF.
+        optics = None if isinstance(method, PinholeRichardsonLucy) else psf
+        return lambda image: reconstruct(image, imager, grid, method, optics=optics)
+
+    return make
 
 
 def _dense(solver: RichardsonLucy | ADMM):
@@ -199,8 +222,12 @@ def _dense(solver: RichardsonLucy | ADMM):
     def make(imager: Imager, grid: Grid, psf: Psf):
         shape = grid.volume_shape
         size, pixels = math.prod(shape), math.prod(imager.sensor.shape)
-        unit = lambda voxel: jnp.zeros(size, jnp.float32).at[voxel].set(1).reshape(shape)
-        column = jax.jit(lambda voxel: ImagingOperator(imager, grid, jnp.asarray(psf)).mv(unit(voxel)).ravel())
+
+        @jax.jit
+        def column(voxel):
+            volume = jnp.zeros(size, jnp.float32).at[voxel].set(1).reshape(shape)
+            return ImagingOperator(imager, grid, jnp.asarray(psf)).mv(volume).ravel()
+
         matrix = np.empty((size, pixels), np.float32)
         for voxel in range(size):
             matrix[voxel] = column(voxel)
@@ -218,25 +245,27 @@ def _dense(solver: RichardsonLucy | ADMM):
     return make
 
 
+def _after_backprojection(finish: Callable[[Any, Imager, Grid], Any]):
+    def make(imager: Imager, grid: Grid, psf: Psf):
+        first = _matrix_free("backproject")(imager, grid, psf)
+        return lambda image: finish(first(image), imager, grid)
+
+    return make
+
+
 def _points(imager: Imager, grid: Grid, psf: Psf):
     return lambda image: render_points(find_points(image, imager, grid), grid, particle_width(imager))
 
 
-def _clusters(imager: Imager, grid: Grid, psf: Psf):
-    first, width = _matrix_free("backproject")(imager, grid, psf), particle_width(imager)
-    return lambda image: render_points(find_clusters(first(image), grid), grid, width)
-
-
-def _network(imager: Imager, grid: Grid, psf: Psf):
-    first, network = _matrix_free("backproject")(imager, grid, psf), pretrained()
-    return lambda image: suppress(first(image), network)
+def _clusters(volume, imager: Imager, grid: Grid) -> Volume:
+    return render_points(find_clusters(volume, grid), grid, particle_width(imager))
 
 
 METHODS = {
     "backproject": Method(_matrix_free("backproject")),
     "backproject + points": Method(_points),
-    "backproject + clusters": Method(_clusters),
-    "backproject + unet": Method(_network),
+    "backproject + clusters": Method(_after_backprojection(_clusters)),
+    "backproject + unet": Method(_after_backprojection(lambda volume, imager, grid: suppress(volume, pretrained()))),
     "list-rl": Method(_matrix_free("list-rl")),
     "richardson-lucy": Method(_matrix_free("richardson-lucy")),
     "fista": Method(_matrix_free("fista"), minimises=FISTA(STEPS)),
@@ -303,7 +332,7 @@ def run(
     methods: Sequence[str] = tuple(METHODS),
     seeds: Sequence[int] = (0, 1, 2),
     limit: float = LIMIT,
-    callback: Callable[[list[dict[str, Any]]], object] = lambda records: None,
+    callback: Callable[[Records], object] = lambda records: None,
     progress: Progress | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Run all methods at all sizes; the records, and what was skipped: `method`, `pairs`, `reason`.
@@ -348,3 +377,102 @@ def run(
                         reason = str(error)
                 skipped.append({"method": name, "pairs": float(side) ** 4, "reason": reason})
     return records, skipped
+
+
+def write_records(path: Path, records: Records, provenance: Provenance | None = None) -> None:
+    """Write the records as JSON, with their provenance."""
+    write_json(path, ({KEY: dict(provenance)} if provenance else {}) | {"records": records})
+
+
+def write(records: Records, skipped: Records, folder: Path, provenance: Provenance | None = None) -> None:
+    """Write `benchmark.json`, `.csv`, `.md` and `.png`, and `benchmark-notes.json`.
+
+    Raises `InputError` if the folder cannot be written to.
+    """
+    write_records(folder / "benchmark.json", records, provenance)
+    notes = {"machine": describe(), "slopes": time_exponents(records), "left_out": skipped}
+    write_json(folder / "benchmark-notes.json", notes)
+    with atomic_write(folder / "benchmark.csv") as path, path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list[str](COLUMNS))
+        writer.writeheader()
+        writer.writerows(records)
+    write_text(folder / "benchmark.md", markdown(records, skipped), [".md"])
+    write_figure(folder / "benchmark.png", picture(records))
+
+
+def _by_method(records: Records, key: str) -> dict[str, dict[float, list[float]]]:
+    """Values of a key that are known, by method and pairs."""
+    values: dict[str, dict[float, list[float]]] = {}
+    for record in records:
+        if record[key] is not None:
+            values.setdefault(record["method"], {}).setdefault(record["pairs"], []).append(record[key])
+    return values
+
+
+def time_exponents(records: Records) -> dict[str, float]:
+    """Exponent of the time in pairs of each method, by linear regression of the logarithms from 1e6 to 2e9 pairs."""
+    exponents = {}
+    for name, seconds in _by_method([r for r in records if r["seconds"] > 0 and r["pairs"] < 3e9], "seconds").items():
+        if len(seconds) > 1:
+            pairs, times = np.log([(pairs, value) for pairs, values in seconds.items() for value in values]).T
+            exponents[name] = float(np.polyfit(pairs, times, 1)[0])
+    return exponents
+
+
+def markdown(records: Records, skipped: Records) -> str:
+    """Tables of time, memory and quality by pairs, exponents of time, and what was skipped."""
+    sizes = sorted({record["pairs"] for record in records})
+    measured = [record for record in records if record["seconds"] > 0]
+
+    def cell(values: Sequence[float], form: str) -> str:
+        if not values:
+            return "-"
+        mean = format(float(np.mean(values)), form)
+        return mean if len(values) == 1 else f"{mean} +- {format(float(np.std(values, ddof=1)), form)}"
+
+    parts = [_STOP]
+    for title, key, form, some in (
+        ("Time, s (the fastest of some warm calls)", "seconds", ".2g", measured),
+        ("Compilation (of a dense method: the matrix too), s", "compile_seconds", ".2g", measured),
+        ("Memory that is added at the peak, MiB (at the first size: the compiler too)", "peak_mib", ".0f", measured),
+        ("PSNR, dB", "psnr_db", ".1f", records),
+        ("SSIM", "ssim", ".3f", records),
+        ("MSE", "mse", ".1e", records),
+        ("F1 of the peaks", "f1", ".2f", records),
+        ("Objective of least squares, over that of an empty volume", "objective", ".4f", records),
+    ):
+        rows = _by_method(some, key).items()
+        body = [[name, *(cell(values.get(size, []), form) for size in sizes)] for name, values in rows]
+        parts += [f"**{title}**", markdown_table(["pairs", *(f"{size:.1e}" for size in sizes)], body)]
+    rows = [[name, f"{exponent:.2f}", _PAPER.get(name, "-")] for name, exponent in time_exponents(records).items()]
+    parts += ["**Exponent of time in pairs, 1e6 to 2e9**", markdown_table(["method", "measured", "paper"], rows)]
+    if skipped:
+        rows = [[row["method"], f"{row['pairs']:.1e}", row["reason"]] for row in skipped]
+        parts += ["**Left out**", markdown_table(["method", "pairs", "why"], rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def picture(records: Records) -> Figure:
+    """The panels of Fig. 9 and two more: means, with standard deviations as bars."""
+    figure = Figure(figsize=(12, 8), dpi=100, layout="constrained")
+    for axes, (key, label) in zip(figure.subplots(2, 3).flat, _PANELS.items(), strict=True):
+        is_cost = key in COSTS
+        for method, by_pairs in _by_method(records, key).items():
+            if method == "zeros" and is_cost:
+                continue
+            pairs, values = zip(*sorted(by_pairs.items()), strict=True)
+            errors = None if is_cost else [np.std(some) for some in values]
+            axes.errorbar(pairs, [np.mean(some) for some in values], errors, **line_of(method))
+        axes.set(xscale="log", xlabel="pixel-voxel pairs", ylabel=label)
+        if is_cost or key == "mse":
+            axes.set_yscale("log")
+        axes.grid(alpha=0.25)
+    handles, labels = figure.axes[2].get_legend_handles_labels()
+    figure.legend(handles, labels, title=_STOP, loc="outside lower center", ncols=5, fontsize=9)
+    return figure
