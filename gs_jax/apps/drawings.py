@@ -5,7 +5,7 @@ Charts and layouts take under a millisecond, so that `gs-jax explore` draws them
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import resources
+from importlib import import_module
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from ..optics import theory
 from ..optics.psf import least_samples, spot_image
 from ..optics.raytrace import to_numpy
 from .device_model import lenses_that_see
-from .pictures import round_length
+from .pictures import png_uri, round_length, to_uint8
 
 # Left, right, top and bottom of a chart's axes in its 440 x 290 pixels, and line styles to tell lines without colours.
 _FRAME, _DASHES = (56, 428, 12, 246), ("", "7 4", "2 3", "9 3 2 3", "4 4", "1 4", "12 4")
@@ -45,14 +45,32 @@ _PSF_DEPTHS, FIELDS = 5, (0.0, 0.5, 1.0)
 Numbers = Sequence[float | None] | np.ndarray
 
 
-@cache
-def _macros() -> Any:
+def template(name: str) -> Any:
+    """A template of the folder `templates`, by jinja2."""
     with needs_extra("report"):
-        import jinja2
+        import_module("jinja2")
+    return _environment().get_template(name)
 
-    text = (resources.files("gs_jax") / "apps" / "templates" / "drawings.html").read_text("utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    return environment.from_string(text).module
+
+@cache
+def _environment() -> Any:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("gs_jax", "apps/templates"),
+        autoescape=jinja2.select_autoescape(["html"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    environment.filters["number"] = lambda value: f"{value:.4g}" if np.isfinite(value) else "-"
+    return environment
+
+
+def _macros() -> Any:
+    return template("drawings.html").module
 
 
 def line_chart(
@@ -266,13 +284,9 @@ def _outlines(imager: Imager) -> str:
 
 
 class Psfs(NamedTuple):
-    """PSFs on the sensor, each with the sum 1, or 0 if no light arrives, at depths and field heights, mm.
+    """PSFs on the sensor at depths and field heights, mm; the sum of each is the share of the light in its window."""
 
-    `caught` is the share of the light through the lens that falls into the window.
-    """
-
-    images: Float[np.ndarray, "depth field row column"]
-    caught: Float[np.ndarray, "depth field"]
+    light: Float[np.ndarray, "depth field row column"]
     depths: Float[np.ndarray, " depth"]
     heights: Float[np.ndarray, " field"]
 
@@ -291,19 +305,30 @@ def simulate_psfs(imager: Imager, depths: Float[np.ndarray, " depth"], diameter:
     size = 2 * int(np.clip(_WINDOW_RADII * radius / pixel, *_WINDOW) // 2) + 1
     options = {"size": size, "radius": diameter / 2, "samples": samples}
     light = np.array([[spot_image(imager, depth, height, **options) for height in heights] for depth in chosen])
-    caught = light.sum((2, 3))
-    return Psfs(light / np.where(caught > 0, caught, 1)[..., None, None], caught, chosen, heights)
+    return Psfs(light, chosen, heights)
+
+
+def spot_rows(psfs: Psfs) -> list[tuple[float, list[tuple[str, float]]]]:
+    """A row per field height: pictures of spots by depth, as the square root, and the light in their windows, %."""
+
+    def cell(light: Float[np.ndarray, "row column"]) -> tuple[str, float]:
+        light = np.nan_to_num(light)
+        root = np.sqrt(np.maximum(light, 0) / max(light.max(), 1e-30))
+        return png_uri(to_uint8(root, 0.0, 1.0), "magma"), 100 * float(light.sum())
+
+    by_field = zip(psfs.heights, psfs.light.swapaxes(0, 1), strict=True)
+    return [(height, [cell(light) for light in by_depth]) for height, by_depth in by_field]
 
 
 def mtf(
-    psf: Float[np.ndarray, "row column"], caught: float, pixel: float, magnification: float
+    light: Float[np.ndarray, "row column"], pixel: float, magnification: float
 ) -> tuple[Float[np.ndarray, " frequency"], Float[np.ndarray, " frequency"]]:
     """Frequencies in the object up to the pixels' limit, 1/mm, and the modulation transfer, mean of x and y.
 
     Light outside the window counts as uniform: the curve drops by its share at the first frequency.
     """
-    x, y = (np.abs(np.fft.rfft(psf.sum(axis), _PADDED)) for axis in (0, 1))
-    values = caught * (x + y) / 2
+    x, y = (np.abs(np.fft.rfft(light.sum(axis), _PADDED)) for axis in (0, 1))
+    values = (x + y) / 2
     values[0] = 1.0
     return np.fft.rfftfreq(_PADDED, pixel) * magnification, values
 

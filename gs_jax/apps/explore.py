@@ -11,17 +11,16 @@ import time
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import numpy as np
 
-from ..base.errors import InputError, needs_extra
+from ..base.errors import InputError
 from ..codesign.study import Study
 from ..design.design import Design, write_design
-from .drawings import draw_layout, line_chart
+from .drawings import Psfs, draw_layout, line_chart, spot_rows, template
 from .explore_design import (
     SPOT_DEPTHS,
     SPOT_FIELDS,
@@ -39,7 +38,6 @@ from .explore_design import (
     start_of,
 )
 from .pictures import png_uri, to_uint8
-from .report import render
 
 HOST = "127.0.0.1"
 # Of a request's body, bytes: seven numbers with their names.
@@ -78,23 +76,18 @@ class Session:
     """
 
     def __init__(self, design: Design, study: Study | None, path: Path, provenance: dict[str, str]):
-        with needs_extra("report"):
-            import jinja2
+        self.html = template("parts.html").module
         self.design, self.study, self.path, self.provenance = design, study, path, provenance
         self.start, self.sliders = start_of(design, study), make_sliders(design)
         self.terms = live_terms(study)
         self.kept: list[tuple[str, Values, Evaluation]] = []
-        environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-        environment.filters["number"] = lambda value: f"{value:.4g}" if np.isfinite(value) else "-"
-        text = (resources.files("gs_jax") / "apps" / "templates" / "parts.html").read_text("utf-8")
-        self.html: Any = environment.from_string(text).module
         self.keep({}, "start")
 
     def page(self, token: str) -> str:
         """The page, as HTML."""
         late = [table.name for table in (self.study.terms if self.study else ()) if table.name not in self.terms]
         context = {"design": self.design, "sliders": self.sliders, "token": token, "late": late}
-        return render("explore.html", context)
+        return template("explore.html").render(context)
 
     def move(self, values: Values) -> dict[str, Any]:
         """Evaluate the design of these values: parts of the page by name, and the time that it took."""
@@ -103,11 +96,13 @@ class Session:
         imager = moved_imager(self.start, values)
         ghosts = map_ghosts(imager, values["near_mm"], values["far_mm"])
         picture = _picture(np.sqrt(ghosts.crossings), 0.0, max(float(np.sqrt(ghosts.crossings.max())), 1.0))
+        heights = np.array(SPOT_FIELDS) * values["field_radius_mm"]
+        psfs = Psfs(evaluation.spots, evaluation.depths[list(SPOT_DEPTHS)], heights)
         violations = find_violations(self.design, self.study, self.start, values, evaluation)
         parts = {
             "violations": self.html.violations(violations),
             "numbers": self.html.numbers(evaluation, self.kept[0][2]),
-            "spots": self._spots(evaluation, values),
+            "spots": self.html.spots(psfs.depths, spot_rows(psfs)),
             "layout": draw_layout(imager, picture, ghosts.box, "where back-projection puts a point"),
             "chart": self._chart(evaluation),
         }
@@ -152,18 +147,8 @@ class Session:
         lines |= {"now, promised": line(now, "lateral_resolution_um"), "start": line(self.kept[0][2], "rms_width_um")}
         if len(self.kept) > 1:
             lines[f"kept {self.kept[-1][0]}"] = line(self.kept[-1][2], "rms_width_um")
-        labels: Any = {"x": "depth z, mm", "y": "RMS width and FWHM, um", "title": "Image of a point"}
-        return line_chart(lines, **labels, log=True, marks=True)
-
-    def _spots(self, evaluation: Evaluation, values: Values) -> str:
-        def cell(spot):
-            spot = np.nan_to_num(spot)
-            return _picture(np.sqrt(np.maximum(spot, 0) / max(spot.max(), 1e-30)), 0.0, 1.0), 100 * spot.sum()
-
-        by_field = evaluation.spots.swapaxes(0, 1)
-        heights = [share * values["field_radius_mm"] for share in SPOT_FIELDS]
-        rows = [(height, [cell(spot) for spot in spots]) for height, spots in zip(heights, by_field, strict=True)]
-        return self.html.spots(evaluation.depths[list(SPOT_DEPTHS)], rows)
+        axes: Any = {"x": "depth z, mm", "y": "RMS width and FWHM, um", "title": "Image of a point"}
+        return line_chart(lines, **axes, log=True, marks=True)
 
 
 def _picture(values: np.ndarray, low: float, high: float) -> str:

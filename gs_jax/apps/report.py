@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 from collections.abc import Mapping
-from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float, Num
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..base.errors import InputError, needs_extra
+from ..base.errors import InputError
 from ..base.machine import describe
 from ..base.progress import Progress
 from ..design.datasheets import datasheet, findings, overview, path_in_words, summary, tables
@@ -27,7 +26,18 @@ from ..mold.lenslets import Part
 from ..mold.solids import MoldShape, preview_solid
 from ..optics.raytrace import to_numpy
 from ..typing import Image, PathLike, Points
-from .drawings import Psfs, count_lenses, draw_layout, draw_section, ideal_mtf, line_chart, mtf, simulate_psfs
+from .drawings import (
+    Psfs,
+    count_lenses,
+    draw_layout,
+    draw_section,
+    ideal_mtf,
+    line_chart,
+    mtf,
+    simulate_psfs,
+    spot_rows,
+    template,
+)
 from .pictures import (
     block_maxima,
     color_table,
@@ -99,8 +109,7 @@ def write_report(
         If a volume has no grid, or another shape than its grid.
     """
     path, progress = check_output(path, [".html"]), progress or Progress()
-    with needs_extra("report"):
-        import_module("jinja2")
+    page = template("report.html")
     if volume is not None and (grid is None or volume.shape != grid.volume_shape):
         raise ValueError(f"`volume` must have the shape of `grid`, got {volume.shape}.")
     context = {
@@ -136,21 +145,7 @@ def write_report(
             context["points"] = {"count": len(points), "listed": brightest[:_LISTED_POINTS].tolist()}
             views["points"] = _point_view(brightest[:_MAX_POINTS, :3], grid) if len(points) else None
     context["views"] = {name: view for name, view in views.items() if view}
-    write_text(path, render("report.html", context), [".html"])
-
-
-def render(name: str, context: Mapping[str, Any]) -> str:
-    """Render a template of `gs_jax/apps/templates` with the style sheet of the report and its own script."""
-    with needs_extra("report"):
-        import jinja2
-
-    read = lambda name: resources.files("gs_jax").joinpath("apps", "templates", name).read_text("utf-8")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    embedded = {"style": read("page.css"), "script": read(name.replace(".html", ".js"))}
-    return environment.from_string(read(name)).render({**embedded, **context})
+    write_text(path, page.render(context), [".html"])
 
 
 def _optics(design: Design, progress: Progress) -> dict[str, Any]:
@@ -189,7 +184,8 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
         "widths": line_chart(
             widths, x="depth z, mm", y="in the object, um", title="Resolution by depth", log=True, marks=True
         ),
-        "psfs": _psf_pictures(psfs, imager),
+        "psfs": {"depths": psfs.depths, "rows": spot_rows(psfs)},
+        "window": {"pixels": psfs.light.shape[-1], "um": 1000 * psfs.light.shape[-1] * imager.sensor.pixel_pitch},
         **_mtf_charts(psfs, imager, diameter),
     }
 
@@ -212,21 +208,10 @@ def _cells(table: Table) -> dict[str, Any]:
     return {"title": table.title, "heads": heads, "rows": list(zip(*columns, strict=True))}
 
 
-def _psf_pictures(psfs: Psfs, imager: Imager) -> dict[str, Any]:
-    peaks = psfs.images.max((2, 3), keepdims=True)
-    root = to_uint8(np.sqrt(psfs.images / np.where(peaks > 0, peaks, 1)), 0.0, 1.0)
-    rows = [
-        (height, [(png_uri(root[i, j], "magma"), 100 * float(psfs.caught[i, j])) for i in range(len(psfs.depths))])
-        for j, height in enumerate(psfs.heights)
-    ]
-    size = root.shape[-1]
-    return {"depths": psfs.depths, "rows": rows, "size": size, "width_um": 1000 * size * imager.sensor.pixel_pitch}
-
-
 def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
     def curve(i: int, j: int):
         magnification = float(to_numpy(imager).magnification(psfs.depths[i]))
-        return mtf(psfs.images[i, j], float(psfs.caught[i, j]), imager.sensor.pixel_pitch, magnification)
+        return mtf(psfs.light[i, j], imager.sensor.pixel_pitch, magnification)
 
     def chart(curves, title: str) -> str:
         return line_chart(curves, x="frequency in the object, 1/mm", y="contrast", title=title, bounds=(0.0, 1.0))
@@ -235,7 +220,7 @@ def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
     middle = float(psfs.depths[len(psfs.depths) // 2])
     frequency = next(iter(by_depth.values()))[0]
     by_depth[f"ideal, {middle:.4g} mm"] = (frequency, ideal_mtf(frequency, imager, middle, diameter))
-    sharpest = int(np.argmax((psfs.images.max((2, 3)) * psfs.caught)[:, 0]))
+    sharpest = int(np.argmax(psfs.light.max((2, 3))[:, 0]))
     by_field = {f"{h:.3g} mm off axis": curve(sharpest, j) for j, h in enumerate(psfs.heights)}
     return {
         "mtf_depth": chart(by_depth, "On the axis, by depth"),
