@@ -191,21 +191,24 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
 
 
 def _device_rows(design: Design) -> list[tuple[str, str]]:
-    """Keys of the design file and their values; of a value per lens the span."""
-    of_sensor, of_lens, of_array, of_imaging = (
-        table.model_dump(exclude_defaults=True, exclude={"centers_mm", "aspheric_terms"})
-        for table in (design.sensor, design.lens, design.array, design.imaging)
+    """Keys of the design file and their values; of a value per lens, and of the working distance, the span."""
+    listed = {"centers_mm", "aspheric_terms", "spectrum_nm"}
+    of_lens, of_array, of_sensor, of_imaging = (
+        table.model_dump(exclude_defaults=True, exclude=listed)
+        for table in (design.lens, design.array, design.sensor, design.imaging)
     )
-    of_lens = {key: value if isinstance(value, str) else span_of(value) for key, value in of_lens.items()}
-    rows = {"lenses": len(design.array.centers_mm)} | of_lens | of_array | of_sensor | of_imaging
-    texts = [" x ".join(map(str, value)) if isinstance(value, tuple) else str(value) for value in rows.values()]
-    return [(key.replace("_", " "), text) for key, text in zip(rows, texts, strict=True)]
+    rows = {"lenses": len(design.array.centers_mm)}
+    rows |= {key: value if isinstance(value, str) else span_of(value) for key, value in (of_lens | of_imaging).items()}
+    sizes = of_array | of_sensor
+    rows |= {key: " x ".join(map(str, value)) if isinstance(value, tuple) else value for key, value in sizes.items()}
+    return [(key.replace("_", " "), str(value)) for key, value in rows.items()]
 
 
 def _cells(table: Table) -> dict[str, Any]:
     """Title, heads and rows of a table for the terminal."""
-    heads, *columns = [column.header for column in table.columns], *(column.cells for column in table.columns)
-    return {"title": table.title, "heads": heads, "rows": list(zip(*columns, strict=True))}
+    heads = [str(column.header).replace("-\n", "").replace("\n", " ") for column in table.columns]
+    rows = list(zip(*(column.cells for column in table.columns), strict=True))
+    return {"title": table.title, "heads": heads, "rows": rows}
 
 
 def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
