@@ -8,9 +8,16 @@ import tifffile
 from scipy.signal import fftconvolve
 
 from gs_jax import FISTA, ConvolutionADMM, ConvolutionOperator, InputError, solve
-from gs_jax.reconstruction.deconvolution import cut_sides, deconvolve, filter_image, normalise_spots, run_deconvolution
+from gs_jax.reconstruction.deconvolution import (
+    choose_smoothness,
+    cut_sides,
+    deconvolve,
+    filter_image,
+    held_out_squares,
+    normalise_spots,
+    run_deconvolution,
+)
 from gs_jax.reconstruction.inverse_problem import subtract_offset
-from gs_jax.reconstruction.smoothness import choose_smoothness, held_out_squares
 
 from .helpers import needs
 

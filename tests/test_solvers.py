@@ -17,14 +17,18 @@ from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.projection.measured_psf import ConvolutionOperator
 from gs_jax.reconstruction.pipeline import PinholeRichardsonLucy
-from gs_jax.solvers.admm import ADMM, ConvolutionADMM, shrink, total_variation
-from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, solve
+from gs_jax.solvers.admm import ADMM, ConvolutionADMM
+from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, shrink, solve, total_variation
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
 from gs_jax.solvers.surface import Surface
 
 from .helpers import compilations, scene
 
+RNG = np.random.default_rng(0)
+# A dense operator, whose entries are positive, and its matrix by NumPy: what need not be compiled is not.
+MATRIX = RNG.random((30, 12))
+DENSE = lx.MatrixLinearOperator(jax.device_put(MATRIX))
 # Nothing but the squares, where there is a choice.
 SOLVERS = {"R-L": RichardsonLucy, "FISTA": partial(FISTA, sparsity=0.0), "ADMM": partial(ADMM, sparsity=0.0)}
 
@@ -33,85 +37,58 @@ def small():
     return scene(voxels=(8, 7), pitch=0.1, depths=(18.0, 20.0))
 
 
-def dense():
-    matrix = jax.random.uniform(jax.random.key(0), (30, 12))
-    return lx.MatrixLinearOperator(matrix)
-
-
-def blurred(imager, grid, dtype=jnp.float64):
+def blurred(imager, grid):
     """The forward model with a PSF, which is not the adjoint of back-projection."""
-    psf = jnp.broadcast_to(jnp.outer(w := jnp.array([0.25, 0.5, 0.25], dtype), w), (grid.depths.size, 3, 3))
-    structure = jax.ShapeDtypeStruct(grid.volume_shape, dtype)
+    psf = np.broadcast_to(np.outer(w := np.array([0.25, 0.5, 0.25]), w), (grid.depths.size, 3, 3))
+    structure = jax.ShapeDtypeStruct(grid.volume_shape, float)
     return lx.FunctionLinearOperator(lambda volume: forward(volume, imager, grid, psf), structure)
 
 
-def convolution():
-    psf = jax.random.uniform(jax.random.key(3), (2, 5, 4))
-    return ConvolutionOperator(psf, (12, 10))
-
-
 OPERATORS = {
+    "dense": lambda: DENSE,
+    "convolution": lambda: ConvolutionOperator(RNG.random((2, 5, 4)), (12, 10)),
     "ray": lambda: ImagingOperator(*small()),
     "blurred": lambda: blurred(*small()),
-    "dense": dense,
-    "convolution": convolution,
 }
-
-
 # To compile an operator of rays for each solver takes seconds.
 EVERY = [pytest.param(name, marks=[pytest.mark.slow] * (name in ("ray", "blurred"))) for name in OPERATORS]
 
 
-def light(A):
-    """Two bright voxels that much of the image sees."""
-    x = jnp.zeros(A.in_structure().shape)
-    seen = A.T.mv(jnp.ones(A.out_structure().shape)).ravel()
-    well = np.flatnonzero(seen > 0.7 * seen.max())
-    return x.reshape(-1).at[well[[len(well) // 4, -len(well) // 4]]].set(jnp.array([1.0, 2.0])).reshape(x.shape)
-
-
 @cache
 def made(operator):
-    return OPERATORS[operator]()
-
-
-@cache
-def compiled(solver, operator):
-    return lambda image: solve(made(operator), image, SOLVERS[solver](steps=150))
+    """An operator, a scene of two bright voxels that much of the image sees, and its image."""
+    A = OPERATORS[operator]()
+    seen = np.asarray(jax.jit(lambda y: A.T.mv(y))(np.ones(A.out_structure().shape)))
+    well, x = np.flatnonzero(seen > 0.7 * seen.max()), np.zeros(seen.shape)
+    x.flat[well[[len(well) // 4, -len(well) // 4]]] = 1.0, 2.0
+    return A, x, np.asarray(jax.jit(lambda x: A.mv(x))(x))
 
 
 @pytest.mark.parametrize("operator", EVERY)
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_it_finds_two_bright_voxels(solver, operator):
-    A = made(operator)
-    x = light(A)
-    found = compiled(solver, operator)(A.mv(x))
+def test_it_finds_two_bright_voxels_and_nothing_in_the_dark(solver, operator):
+    A, x, image = made(operator)
+    found, dark = (solve(A, light, SOLVERS[solver](steps=150)) for light in (image, 0 * image))
     assert found.stats["num_steps"] == 150 and found.result == RESULTS.steps_taken
     # Noiseless, but slow along the least eigenvalues: what matters is that the light is where it was.
     bright = np.argsort(np.asarray(found.value).ravel())[-2:]
-    assert set(bright.tolist()) == set(np.flatnonzero(np.asarray(x)).tolist())
-    assert np.all(np.isfinite(found.stats["costs"])) and found.stats["costs"][-1] < 0.05 * found.stats["costs"][0]
-
-
-@pytest.mark.parametrize("operator", EVERY)
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_dark_image_gives_zeros(solver, operator):
-    found = compiled(solver, operator)(jnp.zeros(made(operator).out_structure().shape))
-    assert not np.any(found.value) and not np.any(found.stats["costs"])
+    assert set(bright.tolist()) == set(np.flatnonzero(x).tolist())
+    costs = np.asarray(found.stats["costs"])
+    assert np.isfinite(costs).all() and costs[-1] < 0.05 * costs[0]
+    assert not np.asarray(dark.value).any() and not np.asarray(dark.stats["costs"]).any()
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_zero_operators_integers_and_float32(solver):
-    A, make = dense(), SOLVERS[solver]
-    zero = lx.MatrixLinearOperator(jnp.zeros((30, 12)))
-    assert not np.any(solve(zero, jnp.ones(30), make(steps=5)).value)
-    image = jnp.arange(30, dtype=jnp.uint16)
-    run = lambda image: solve(A, image, make(steps=5)).value
-    np.testing.assert_array_equal(run(image), run(image.astype(float)))
-    single = lx.MatrixLinearOperator(A.matrix.astype(jnp.float32))
-    dark = solve(single, jnp.zeros(30, jnp.float32), make(steps=20, tolerance=1e-3))
-    assert dark.result == RESULTS.converged and dark.value.dtype == jnp.float32 and not np.any(dark.value)
-    assert np.array_equal(np.isnan(dark.stats["costs"]), np.arange(20) >= dark.stats["num_steps"])
+    zero, make = lx.MatrixLinearOperator(jax.device_put(0 * MATRIX)), SOLVERS[solver]
+    assert not np.asarray(solve(zero, np.ones(30), make(steps=5)).value).any()
+    image = np.arange(30, dtype=np.uint16)
+    of_counts, of_floats = (solve(DENSE, light, make(steps=5)).value for light in (image, image.astype(float)))
+    np.testing.assert_array_equal(of_counts, of_floats)
+    single = lx.MatrixLinearOperator(jax.device_put(MATRIX.astype(np.float32)))
+    dark = solve(single, np.zeros(30, np.float32), make(steps=20, tolerance=1e-3))
+    assert dark.result == RESULTS.converged and dark.value.dtype == jnp.float32 and not np.asarray(dark.value).any()
+    assert np.array_equal(np.isnan(dark.stats["costs"]), np.arange(20) >= int(dark.stats["num_steps"]))
 
 
 @pytest.mark.parametrize(
@@ -128,8 +105,8 @@ def test_zero_operators_integers_and_float32(solver):
 )
 def test_other_numbers_run_the_same_program(make, options):
     """Of the image, the operator, a weight or the tolerance; the result is that of the steps one by one."""
-    A = convolution() if make in (ConvolutionADMM, Surface) else dense()
-    image = np.asarray(A.mv(jnp.arange(float(A.in_size())).reshape(A.in_structure().shape)))
+    A, x, _ = made("convolution" if make in (ConvolutionADMM, Surface) else "dense")
+    image = np.asarray(A.mv(np.arange(float(x.size)).reshape(x.shape)))
     results = []
     for factor in (1.0, 2.0):
         scaled = jax.tree.map(partial(jnp.multiply, factor), A)
@@ -137,26 +114,32 @@ def test_other_numbers_run_the_same_program(make, options):
         numbers = {name: factor * value for name, value in options.items()}
         results.append(solve(scaled, factor * image, make(steps=12, **numbers)))
         compiled = compilations() - before
-    assert compiled == 0 and results[0].value.shape == A.in_structure().shape
+    assert compiled == 0 and results[0].value.shape == x.shape
     one: Any = make(**numbers)
     step, state = eqx.filter_jit(one.step), eqx.filter_jit(one.init)(scaled, 2.0 * image)
-    for _ in range(int(results[1].stats["num_steps"])):
-        state, _, _ = step(scaled, 2.0 * image, state)
+    steps = int(results[1].stats["num_steps"])
+    costs, residuals = np.zeros((2, steps))
+    for number in range(steps):
+        state, costs[number], residuals[number] = step(scaled, 2.0 * image, state)
+    # Compiled apart, the same sums are rounded otherwise.
     np.testing.assert_allclose(results[1].value, one.estimate(state), rtol=1e-9)
+    np.testing.assert_allclose(costs, results[1].stats["costs"][:steps], rtol=1e-9)
+    converged = results[1].result == RESULTS.converged
+    assert (residuals[:-1] >= one.tolerance).all() and (residuals[-1] < one.tolerance) == converged
 
 
 def test_solve_goes_on_and_says_how_it_ended():
-    A, image, few = dense(), jnp.arange(30.0), FISTA(steps=5)
-    half = solve(A, image, few)
-    whole = solve(A, image, few, max_steps=10)
-    np.testing.assert_array_equal(solve(A, image, few, state=half.state).value, whole.value)
+    image, few = np.arange(30.0), FISTA(steps=5)
+    half = solve(DENSE, image, few)
+    whole = solve(DENSE, image, few, max_steps=10)
+    np.testing.assert_array_equal(solve(DENSE, image, few, state=half.state).value, whole.value)
     assert whole.stats["costs"].shape == (10,) and RESULTS[whole.result] == "All steps were taken."
-    wrong = image.at[3].set(jnp.nan)
-    assert solve(A, wrong, few, throw=False).result == RESULTS.not_finite
+    wrong = np.where(np.arange(30) == 3, np.nan, image)
+    assert solve(DENSE, wrong, few, throw=False).result == RESULTS.not_finite
     with pytest.raises(InputError, match="The estimate is not finite: .*NaN"):
-        solve(A, wrong, few)
+        solve(DENSE, wrong, few)
     with pytest.raises(RuntimeError, match="The estimate is not finite"):
-        eqx.filter_jit(lambda image: solve(A, image, few).value)(wrong)
+        eqx.filter_jit(lambda image: solve(DENSE, image, few).value)(wrong)
 
 
 def by_geometry():
@@ -170,7 +153,7 @@ def by_geometry():
 
 
 # What makes an operator, and from what.
-PARAMETRIC = {"dense": lambda: (lx.MatrixLinearOperator, (dense().matrix,)), "ray": by_geometry}
+PARAMETRIC = {"dense": lambda: (lx.MatrixLinearOperator, (DENSE.matrix,)), "ray": by_geometry}
 KINDS = ["dense", pytest.param("ray", marks=pytest.mark.slow)]
 
 
@@ -178,13 +161,13 @@ KINDS = ["dense", pytest.param("ray", marks=pytest.mark.slow)]
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_gradients_by_image_and_operator(solver, kind):
-    """Through a fixed number of steps, once (the ray operator has no second derivative)."""
+    """Through a fixed number of steps, once (the ray operator has no second derivative); finite in the dark."""
     operator, parameters = PARAMETRIC[kind]()
     A = operator(*parameters)
-    row, column = jnp.meshgrid(*(jnp.arange(n, dtype=float) for n in (*A.out_structure().shape, 1)[:2]), indexing="ij")
-    image = (2 + jnp.sin(row / 10) + jnp.cos(column / 12 + row / 15)).reshape(A.out_structure().shape)
+    row, column = np.meshgrid(*(np.arange(n, dtype=float) for n in (*A.out_structure().shape, 1)[:2]), indexing="ij")
+    image = (2 + np.sin(row / 10) + np.cos(column / 12 + row / 15)).reshape(A.out_structure().shape)
     options = SOLVERS[solver](steps=3, **({"cg_steps": 3} if solver == "ADMM" else {}))
-    weight = jax.random.normal(jax.random.key(5), A.in_structure().shape)
+    weight = np.random.default_rng(5).normal(size=A.in_structure().shape)
 
     @jax.jit
     def moment(image, *parameters):
@@ -192,64 +175,30 @@ def test_gradients_by_image_and_operator(solver, kind):
 
     # Steps of 1e-6 mm stay within a pixel at this generic point; rounding of 1e-13 then costs 1e-6.
     check_grads(moment, (image, *parameters), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_gradients_stay_finite_in_the_dark(solver, kind):
-    operator, parameters = PARAMETRIC[kind]()
-
-    def total(image, parameters):
-        return jnp.sum(solve(operator(*parameters), image, SOLVERS[solver](steps=2)).value)
-
-    dark = jnp.zeros(operator(*parameters).out_structure().shape)
-    value, gradient = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(dark, parameters)
-    assert value == 0 and all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_an_early_end_and_the_same_step_by_step(solver):
-    A = dense()
-    image, options = A.mv(light(A)), SOLVERS[solver](steps=400, tolerance=0.02)
-    found = solve(A, image, options)
-    assert found.result == RESULTS.converged and 1 < found.stats["num_steps"] < 400
-    step = jax.jit(lambda state: options.step(A, image, state))
-    state, costs, residuals = options.init(A, image), [], []
-    for _ in range(int(found.stats["num_steps"])):
-        state, cost, residual = step(state)
-        costs.append(cost)
-        residuals.append(residual)
-    assert min(residuals[:-1]) >= 0.02 > residuals[-1]
-    # Compiled apart, the same sums are rounded otherwise.
-    np.testing.assert_allclose(costs, found.stats["costs"][: found.stats["num_steps"]], rtol=1e-9)
-    np.testing.assert_allclose(options.estimate(state), found.value, atol=1e-9)
+    value, gradient = jax.jit(jax.value_and_grad(moment, argnums=(0, 1)))(0 * image, *parameters)
+    assert value == 0 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 @pytest.mark.parametrize("solver", ["FISTA", "ADMM"])
 def test_least_squares_without_negative_values_is_scipys(solver):
     """More equations than unknowns and noise: one solution, on the boundary."""
-    A = dense()
-    image = jax.random.normal(jax.random.key(2), (30,)) + 1
-    expected = nnls(np.asarray(A.as_matrix()), np.asarray(image))[0]
+    image = np.random.default_rng(2).normal(size=30) + 1
+    expected = nnls(MATRIX, image)[0]
     assert 0 < np.count_nonzero(expected) < 12
-    found = solve(A, image, SOLVERS[solver](steps=3000))
+    found = solve(DENSE, image, SOLVERS[solver](steps=3000))
     np.testing.assert_allclose(found.value, expected, atol=1e-8)  # they converge linearly, to the last digits
 
 
 def test_the_convex_solvers_meet_with_sparsity():
-    A = dense()
     # Perron's eigenvalue is far above the next here.
-    largest = np.linalg.svd(np.asarray(A.as_matrix()), compute_uv=False)[0] ** 2
-    np.testing.assert_allclose(largest_eigenvalue(A), largest, rtol=1e-10)
-    image = A.mv(light(A)) + 0.1 * jax.random.normal(jax.random.key(4), A.out_structure().shape)
-    weight = 0.02 * A.T.mv(image).max()
+    largest = np.linalg.svd(MATRIX, compute_uv=False)[0] ** 2
+    np.testing.assert_allclose(jax.jit(largest_eigenvalue)(DENSE), largest, rtol=1e-10)
+    image = made("dense")[2] + 0.1 * np.random.default_rng(4).normal(size=30)
+    weight = 0.02 * (MATRIX.T @ image).max()
 
     def final(solver):
-        x = solve(A, image, solver).value
-        residual = A.mv(x) - image
-        return float(jnp.vdot(residual, residual) / 2 + weight * jnp.sum(x))
+        x = np.asarray(solve(DENSE, image, solver).value)
+        return ((MATRIX @ x - image) ** 2).sum() / 2 + weight * x.sum()
 
     costs = [final(solver(steps=1000, sparsity=0.02)) for solver in (FISTA, ADMM)]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-10)
@@ -257,25 +206,11 @@ def test_the_convex_solvers_meet_with_sparsity():
 
 @pytest.mark.parametrize("solver", [FISTA, ADMM])
 def test_zero_is_optimal_from_a_sparsity_of_1(solver):
-    A = dense()
-    image = A.mv(light(A))
-    run = lambda b, sparsity: solve(A, b, solver(steps=2000, sparsity=sparsity)).value
+    image = made("dense")[2]
+    run = lambda b, sparsity: np.asarray(solve(DENSE, b, solver(steps=2000, sparsity=sparsity)).value)
     np.testing.assert_allclose(run(image, 1.01), 0, atol=1e-9)
     assert run(image, 0.99).max() > 1e-3
-    assert lambda_max(-image) == 0 and not np.any(run(-image, 0.5))
-
-
-def test_a_weight_that_changes_compiles_nothing(caplog):
-    """Weights are leaves of a solver, not part of its code."""
-    run = jax.jit(lambda image, solver: solve(dense(), image, solver).value)
-    image = jnp.ones(30)
-    with jax.log_compiles(), caplog.at_level("WARNING"):
-        first = run(image, FISTA(steps=3, sparsity=0.5))
-        assert [r for r in caplog.records if "Compiling" in r.getMessage()]
-        caplog.clear()
-        second = run(image, FISTA(steps=3, sparsity=0.01))
-        assert not [r for r in caplog.records if "Compiling" in r.getMessage()]
-    assert np.any(np.asarray(first) != np.asarray(second))
+    assert lambda_max(jax.device_put(-image)) == 0 and not run(-image, 0.5).any()
 
 
 def test_richardson_lucy_is_scikit_images():
@@ -286,49 +221,42 @@ def test_richardson_lucy_is_scikit_images():
     truth = np.zeros((40, 42))
     truth[12:28, 14:28] = rng.random((16, 14))
     system = ConvolutionOperator(psf[None], truth.shape)
-    embedded = jnp.zeros(system.scene_shape).at[(0, *system.window)].set(truth)
+    embedded = np.zeros(system.scene_shape)
+    embedded[0][system.window] = truth
     image = np.maximum(np.asarray(system.mv(embedded)), 0)
     image[image < 1e-12] = 0  # an FFT's rounding
     expected = of_skimage(image, psf, num_iter=25, clip=False)
-    found = solve(system, jnp.asarray(image), RichardsonLucy(steps=25))
+    found = np.asarray(solve(system, image, RichardsonLucy(steps=25)).value)
     # The same iteration in exact arithmetic; 25 divisions amplify the rounding of the FFTs.
-    np.testing.assert_allclose(found.value[0][system.window], expected, atol=1e-8)
+    np.testing.assert_allclose(found[0][system.window], expected, atol=1e-8)
 
 
 @pytest.mark.integration
 def test_richardson_lucy_with_background_acceleration_and_total_variation():
-    A = ImagingOperator(*small())
-    truth = light(A)
+    A, truth, clean = made("ray")
     run = lambda image, **options: solve(A, image, RichardsonLucy(steps=40, **options))
-    image = A.mv(truth) + 0.5
-    plain, known = run(image), run(image, background=0.5)
-    assert jnp.abs(known.value - truth).max() < 0.05 < jnp.abs(plain.value - truth).max()
-    fast = run(A.mv(truth), accelerate=True)
-    assert fast.stats["costs"][-1] < 1e-3 * run(A.mv(truth)).stats["costs"][-1]
-    rough = run(image + 0.3 * jax.random.uniform(jax.random.key(1), image.shape))
-    smooth = run(image + 0.3 * jax.random.uniform(jax.random.key(1), image.shape), tv=0.05)
-    variation = lambda s: sum(float(jnp.abs(jnp.diff(s.value, axis=axis)).sum()) for axis in range(3))
-    assert variation(smooth) < 0.97 * variation(rough)
+    off = lambda solution: np.abs(np.asarray(solution.value) - truth).max()
+    assert off(run(clean + 0.5, background=0.5)) < 0.05 < off(run(clean + 0.5))
+    assert run(clean, accelerate=True).stats["costs"][-1] < 1e-3 * run(clean).stats["costs"][-1]
+    noisy = clean + 0.5 + 0.3 * np.random.default_rng(1).random(clean.shape)
+    variation = lambda s: sum(np.abs(np.diff(s.value, axis=axis)).sum() for axis in range(3))
+    assert variation(run(noisy, tv=0.05)) < 0.97 * variation(run(noisy))
 
 
 @pytest.mark.integration
 def test_richardson_lucy_fits_a_slow_background():
-    A = ImagingOperator(*small())
-    truth = light(A)
-    shape = A.out_structure().shape
-    slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))
-    run = lambda image, knots: solve(A, image, RichardsonLucy(steps=200, background_knots=knots)).value
-    error = lambda image, knots: float(jnp.linalg.norm(run(image, knots) - truth) / jnp.linalg.norm(truth))
-    assert error(A.mv(truth) + slope, 3) < 0.25 * error(A.mv(truth) + slope, 0)
-    assert error(A.mv(truth), 3) < 0.1
-    assert not run(jnp.zeros(shape), 3).any()
+    A, truth, clean = made("ray")
+    slope = 0.5 + np.outer(np.linspace(0, 1, clean.shape[0]), np.linspace(1, 0, clean.shape[1]))
+    run = lambda image, knots: np.asarray(solve(A, image, RichardsonLucy(steps=200, background_knots=knots)).value)
+    error = lambda image, knots: np.linalg.norm(run(image, knots) - truth) / np.linalg.norm(truth)
+    assert error(clean + slope, 3) < 0.25 * error(clean + slope, 0)
+    assert error(clean, 3) < 0.1 and not run(0 * clean, 3).any()
 
 
 def test_unexplained_light_does_not_go_to_voxels_that_few_pixels_see():
     """A column of 16 pixels on a voxel of each, but for the last, which half a percent of a pixel sees."""
-    A = lx.MatrixLinearOperator(jnp.diag(jnp.append(jnp.ones(15), 0.005)))
-    image = jnp.ones(16)
-    run = lambda **options: solve(A, image, RichardsonLucy(steps=10, **options)).value
+    A = lx.MatrixLinearOperator(jax.device_put(np.diag([*np.ones(15), 0.005])))
+    run = lambda **options: np.asarray(solve(A, np.ones(16), RichardsonLucy(steps=10, **options)).value)
     assert run()[-1] == pytest.approx(200)
     held = run(min_sensitivity=0.3)
     np.testing.assert_allclose(held[:-1], 1)
@@ -336,24 +264,25 @@ def test_unexplained_light_does_not_go_to_voxels_that_few_pixels_see():
 
 
 def test_the_background_may_have_more_knots_than_there_are_pixels():
-    image, knots = jnp.ones((3, 40)), jnp.ones((8, 8))
-    np.testing.assert_allclose(bilinear_background(knots, image), 1, rtol=1e-12)
-    assert set(np.round(np.unique(np.asarray(background_step(knots, 2 * image))), 9)) == {0.0, 2.0}
+    image, knots = np.ones((3, 40)), np.ones((8, 8))
+    both = jax.jit(lambda knots, image: (bilinear_background(knots, image), background_step(knots, 2 * image)))
+    background, step = map(np.asarray, both(knots, image))
+    np.testing.assert_allclose(background, 1, rtol=1e-12)
+    assert set(np.round(np.unique(step), 9)) == {0.0, 2.0}
 
 
 def test_richardson_lucy_climbs_and_keeps_the_light():
-    A = dense()
-    image = A.mv(light(A)) * jax.random.uniform(jax.random.key(6), (30,), minval=0.8, maxval=1.2)
-    found = solve(A, image, RichardsonLucy(steps=50))
+    image = made("dense")[2] * np.random.default_rng(6).uniform(0.8, 1.2, 30)
+    found = solve(DENSE, image, RichardsonLucy(steps=50))
     assert np.all(np.diff(found.stats["costs"]) <= 1e-12)
     # After each step the expected image holds as much light as the image (Lucy 1974).
-    np.testing.assert_allclose(A.mv(found.value).sum(), image.sum(), rtol=1e-12)
+    np.testing.assert_allclose((MATRIX @ np.asarray(found.value)).sum(), image.sum(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_wrong_arguments_are_named(solver):
     with pytest.raises(InputError, match=r"image must have the operator's output shape \(30,\), got \(4,\)"):
-        solve(dense(), jnp.zeros(4), SOLVERS[solver](steps=1))
+        solve(DENSE, np.zeros(4), SOLVERS[solver](steps=1))
     with pytest.raises(InputError, match="steps must be 1 or more, got 0"):
         SOLVERS[solver](steps=0)
     with pytest.raises(InputError, match="tolerance must be 0 or more, got -1.0"):
@@ -364,14 +293,14 @@ def test_wrong_arguments_are_named(solver):
         RichardsonLucy(background_knots=1)
     wrong: Any = FISTA
     with pytest.raises(InputError, match="solver must be an object such as FISTA"):
-        solve(dense(), jnp.zeros(30), wrong)
+        solve(DENSE, np.zeros(30), wrong)
     with pytest.raises(InputError, match="image must be real, got complex"):
-        solve(dense(), jnp.zeros(30, complex), SOLVERS[solver](steps=1))
+        solve(DENSE, np.zeros(30, complex), SOLVERS[solver](steps=1))
     for other in (ConvolutionADMM(), PinholeRichardsonLucy()):
         with pytest.raises(InputError, match="must be used with"):
-            solve(dense(), jnp.zeros(30), other)
+            solve(DENSE, np.zeros(30), other)
     with pytest.raises(InputError, match="image must be 2-D .*, got 1-D"):
-        solve(dense(), jnp.zeros(30), RichardsonLucy(background_knots=2))
+        solve(DENSE, np.zeros(30), RichardsonLucy(background_knots=2))
 
 
 def test_differences_and_their_adjoint():
@@ -409,16 +338,14 @@ def test_shrinking_is_the_proximal_map(isotropic):
 @pytest.mark.parametrize("tv", [0.0, 0.01])
 def test_few_applications_of_the_operator_reach_the_minimum(tv):
     """Fewer equations than unknowns, as of a volume. FISTA's search of the largest eigenvalue is not counted."""
-    A = lx.MatrixLinearOperator(jax.random.uniform(jax.random.key(0), (60, 120)))
-    scene = jnp.zeros(120).at[jnp.array([3, 20, 21, 50])].set(1.0)
-    image = A.mv(scene) + 0.05 * jax.random.normal(jax.random.key(1), (60,))
-    unit = A.T.mv(image).max()
+    matrix, rng = np.random.default_rng(0).random((60, 120)), np.random.default_rng(1)
+    A = lx.MatrixLinearOperator(jax.device_put(matrix))
+    image = matrix[:, [3, 20, 21, 50]].sum(1) + 0.05 * rng.normal(size=60)
+    unit = (matrix.T @ image).max()
 
     def final(solver):
-        x = solve(A, image, solver).value
-        residual = A.mv(x) - image
-        variation = total_variation(differences(x), isotropic=False)
-        return float(jnp.vdot(residual, residual) / 2 + unit * (tv * variation + 0.01 * jnp.sum(x)))
+        x = np.asarray(solve(A, image, solver).value)
+        return ((matrix @ x - image) ** 2).sum() / 2 + unit * (tv * np.abs(np.diff(x)).sum() + 0.01 * x.sum())
 
     found, least = (final(ADMM(steps, sparsity=0.01, tv=tv)) for steps in (20, 2000))
     assert found < 1.03 * least
@@ -429,10 +356,11 @@ def test_few_applications_of_the_operator_reach_the_minimum(tv):
 
 def test_isotropic_total_variation_denoises_as_scikit_image_does():
     """The identity as operator; Chambolle's dual method, without wrapping, is what scikit-image has."""
-    image = 3 + jnp.zeros((16, 14)).at[4:9, 5:11].set(2.0) + 0.3 * jax.random.normal(jax.random.key(2), (16, 14))
+    image = 3 + 0.3 * np.random.default_rng(2).normal(size=(16, 14))
+    image[4:9, 5:11] += 2
     A = lx.IdentityLinearOperator(jax.ShapeDtypeStruct(image.shape, image.dtype))
     solver = ADMM(600, sparsity=0.0, tv=0.4 / image.max(), isotropic=True)
     found = solve(A, image, solver)
-    expected = denoise_tv_chambolle(np.asarray(image), weight=0.4, eps=1e-12, max_num_iter=20000)
+    expected = denoise_tv_chambolle(image, weight=0.4, eps=1e-12, max_num_iter=20000)
     # Both converge sublinearly; Chambolle's is at about 1e-4 after so many.
     np.testing.assert_allclose(found.value, expected, atol=2e-3)

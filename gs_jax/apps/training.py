@@ -171,10 +171,9 @@ def unroll(
 ) -> Float[Array, "depth y x"]:
     """Volume after the steps with networks."""
 
-    # Not `step`, whose other branches would keep residuals for the gradient, too.
     def network_step(state, _):
-        lucy, cost, _ = network.network_step(operator, light, state)
-        return state._replace(lucy=lucy, number=state.number + 1), cost
+        state, cost, _ = network.network_step(operator, light, state)
+        return state._replace(number=state.number + 1), cost
 
     return network.estimate(lax.scan(network_step, start, length=network.power.size)[0])
 

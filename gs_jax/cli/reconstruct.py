@@ -285,14 +285,15 @@ def deconvolve_command(
     from ..io.captures import write_capture
     from ..io.recordings import spot_names
     from ..io.volumes import STACK_SUFFIXES, write_planes
-    from ..reconstruction.deconvolution import bin_pixels, filter_image, make_solver, pad_to_largest, run_deconvolution
+    from ..reconstruction.deconvolution import SOLVERS, bin_pixels, filter_image, pad_to_largest, run_deconvolution
+    from ..reconstruction.pipeline import method_by_name
     from ..reconstruction.field_fit import fit_field
 
     files = [path for path in (*psf, psf_places, *camera.files) if path]
     check_outputs(output, STACK_SUFFIXES, inputs=(capture, *files))
     places, solver = None, None
     if method != "wiener":
-        solver = make_solver(method, steps, vars(weights))
+        solver = method_by_name(SOLVERS, method, steps, vars(weights))
     elif given := given_options(_ITERATIVE):
         raise InputError(f"{', '.join(given)} must not be given with --method wiener, which takes no steps.")
     if psf_places:

@@ -23,7 +23,7 @@ from ..optics.lens_types import FIELDS, HALF_SIDE, core_width, warn_if_blurred
 from ..optics.psf_core import ensquared_light
 from ..projection.backprojection import backproject
 from ..typing import Image
-from .background import DetectionImage, Pixels, for_each_band, subtract_background
+from .background import DetectionImage, Pixels, filter_bands, subtract_background
 from .view_samples import (
     COARSE,
     THRESHOLD_SNR,
@@ -187,30 +187,18 @@ def _log_snr(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def _dilate(light: Pixels) -> Pixels:
-    """Maximum of 3 x 3 pixels, a fast `scipy.ndimage.maximum_filter`."""
-    result = np.empty_like(light)
+    """Maximum of 3 x 3 pixels."""
 
-    def dilate(band):
-        tall = light[np.clip(np.arange(band.start - 1, band.stop + 1), 0, len(light) - 1)]
-        most = np.maximum(np.maximum(tall[:-2], tall[1:-1]), tall[2:])
-        wide = result[band]
-        wide[:, -1] = most[:, -1]
-        np.maximum(most[:, :-1], most[:, 1:], out=wide[:, :-1])
-        np.maximum(wide[:, 1:], most[:, :-1], out=wide[:, 1:])
+    def dilate(x):
+        x = np.maximum(np.maximum(x[:-2], x[1:-1]), x[2:])
+        return np.maximum(np.maximum(x[:, :-2], x[:, 1:-1]), x[:, 2:])
 
-    for_each_band(len(light), dilate)
-    return result
+    return filter_bands(light, 1, dilate)
 
 
 def _candidates(rest: DetectionImage, lens_types: Sequence[LensType], voxels: Grid, progress: Progress) -> Positions:
     """Local maxima of the back-projected logarithms, at voxels."""
-    bright = np.empty_like(rest.light)
-
-    def brighten(band):
-        bright[band] = _log_snr(rest.light[band], rest.noise[band])
-
-    for_each_band(len(bright), brighten)
-    planes, image = np.asarray(voxels.depths, np.float64), jax.device_put(bright)
+    planes, image = np.asarray(voxels.depths, np.float64), jax.device_put(_log_snr(rest.light, rest.noise))
     last = len(planes) - 1
     # Parts are equally long: each has a plane of its neighbours, and the last plane repeats.
     parts = math.ceil((last - 1) / (_PLANES - 2))

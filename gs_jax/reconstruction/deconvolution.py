@@ -3,8 +3,11 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Num
 
@@ -18,9 +21,8 @@ from ..solvers.base import estimate_of, run_solver
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..typing import Image
-from .inverse_problem import discrepancy_target, subtract_offset, sum_pixels
+from .inverse_problem import binned_variance, discrepancy_target, subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR
-from .smoothness import Smoothness, choose_smoothness, image_of
 
 # Relative change of the last step below which a solver has converged.
 CONVERGED = 1e-3
@@ -36,6 +38,22 @@ _TAPER = 0.05
 # Ratios of noise to signal that are tried, relative to the largest power of the PSF.
 _RATIOS = np.geomspace(1e-7, 1e-1, 25)
 
+# Weights that are tried: from the first on, weaker and weaker ones, and then stronger and stronger ones, each from the
+# solution of the one before. From nothing, a scene builds up too slowly with a strong weight, and a weak one fits noise
+# before detail.
+_FIRST, _WEAKER, _STRONGER = 1e-3, (3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6), (3e-3, 1e-2)
+# Steps with the first weight and with each other.
+_FIRST_STEPS, _STEPS = 60, 15
+# Mean log error above the least at which no weight further on is tried.
+_WORSE = 0.25
+# Voxels of the scene beyond which pixels are binned for the trials.
+_VOXELS = 2**20
+# Side of the squares that are held out, pixels, and their distance, in sides. Single pixels are told by their
+# neighbours, also where the PSF is wrong: they choose weights that are too weak. In small images squares are smaller.
+_SIDE, _DISTANCE, _LEAST_SQUARES = 8, 4, 16
+# Least error of a square that counts, relative to the mean; and against a division by zero.
+_FLOOR, _TINY = 0.01, 1e-30
+
 Deconvolver = ConvolutionADMM | ADMM | FISTA | RichardsonLucy
 # Solvers by the names of the command line, as functions of the number of steps.
 SOLVERS: dict[str, Callable[[int], Deconvolver]] = {
@@ -44,6 +62,24 @@ SOLVERS: dict[str, Callable[[int], Deconvolver]] = {
     "richardson-lucy": lambda steps: RichardsonLucy(steps, accelerate=True),
 }
 _DEFAULT = SOLVERS["admm"](100)
+
+
+class Smoothness(NamedTuple):
+    """A choice of the weight of total variation.
+
+    Parameters
+    ----------
+    tv
+        The weight.
+    tried
+        The weights that were tried.
+    errors
+        RMS error of the pixels that were held out for each weight, relative to the RMS of all.
+    """
+
+    tv: float
+    tried: tuple[float, ...]
+    errors: tuple[float, ...]
 
 
 class Deconvolution(NamedTuple):
@@ -105,7 +141,7 @@ def deconvolve(
     solver
         Solver that inverts the convolutions. For PSFs over the field `ADMM`, which takes the weights of
         `ConvolutionADMM` if that is given. None: 100 steps of `ConvolutionADMM`, with the weight of total variation
-        that predicts parts of the image best which are held out (`gs_jax.reconstruction.smoothness`).
+        that predicts parts of the image best which are held out (`choose_smoothness`).
     stop_at_discrepancy
         Stop early where the cost is no larger than the image's noise leaves (Morozov's discrepancy principle).
     progress
@@ -242,18 +278,6 @@ def _light(image):
     return light / unit, unit
 
 
-def make_solver(method: str, steps: int, weights: dict[str, float | None]) -> Deconvolver:
-    """The solver of a name with the weights that are given; `InputError` if it lacks one."""
-    solver = SOLVERS[method](steps)
-    given = {name: weight for name, weight in weights.items() if weight is not None}
-    for name in given:
-        if not hasattr(solver, name):
-            option = f"--{name.replace('_', '-')}"
-            allowed = " or ".join(other for other, make in SOLVERS.items() if hasattr(make(1), name))
-            raise InputError(f"{option} must be used with --method {allowed}, got {method}.")
-    return dataclasses.replace(solver, **given)
-
-
 def bin_pixels(image: Num[np.ndarray, "row column"], side: int) -> Num[np.ndarray, "y x"]:
     """Sum squares of pixels; `InputError` if fewer than 2 x 2 are left."""
     if side == 1:
@@ -329,3 +353,125 @@ def _check_memory(solver, system):
 
 def _size(shape):
     return " x ".join(map(str, shape))
+
+
+def choose_smoothness(
+    light: Float32[np.ndarray, "row column"],
+    psf: Float32[np.ndarray, "depth high wide"] | FieldConvolutionOperator,
+    solver: ConvolutionADMM | ADMM,
+    progress: Progress | None = None,
+) -> Smoothness:
+    """Choose the weight of total variation that predicts held-out squares of a capture best.
+
+    *Host.*
+
+    A square of 8 x 8 pixels of every 32 x 32 is left out of the fit. Each point casts light all over its PSF, so the
+    rest of the capture tells what is in the squares. A weight that is too weak fits noise, and errors of the PSF, which
+    the squares do not share; one that is too strong predicts too little detail. So the choice needs to know neither the
+    noise nor the errors of the PSF (cross-validation: Stone, J. R. Stat. Soc. B 36, 111, 1974). The squares' mean log
+    error decides, so that a few bright ones do not outvote the others.
+
+    The weights are tried in a few steps each, from the solution of a weight nearby. Large captures are binned; noise is
+    then added again, so that it is that of single pixels.
+
+    Parameters
+    ----------
+    light
+        The capture above its offset, at most of the order of 1.
+    psf
+        PSFs of the sum 1, or the operator of PSFs that vary over the field, which is not binned.
+    solver
+        Solver with all options but the weight.
+    progress
+        Shows progress.
+    """
+    if isinstance(psf, FieldConvolutionOperator):
+        side, whole = 1, psf
+    else:
+        side = _binning(light.shape, psf.shape)
+        light, spots = _binned(light, side), np.stack([sum_pixels(spot, side) for spot in psf])
+        whole = ConvolutionOperator(spots, light.shape)
+    kept = held_out_squares(light.shape)
+    components = lambda a: (a.components if isinstance(a, FieldConvolutionOperator) else a).kept
+    system = eqx.tree_at(components, whole, jnp.asarray(kept), is_leaf=lambda leaf: leaf is None)
+    trial = dataclasses.replace(solver, steps=_FIRST_STEPS, tolerance=0.0, tv=_FIRST)
+    errors = {}
+
+    def error_of(weight, last=None, before=_FIRST):
+        """Take the steps of a weight from the last state, of another weight; keep the error and return the state."""
+        some = trial if last is None else dataclasses.replace(trial, steps=_STEPS)
+        start = None if last is None else trial.smoother(last, weight / before)
+        state: Any = run_solver(some, kept * light, system, Progress(), state=start).state
+        errors[weight] = _squares((1 - kept) * (np.asarray(image_of(whole, trial.estimate(state))) - light))
+        return state
+
+    with (progress or Progress()).counter("Choosing the smoothness", 1 + len(_WEAKER) + len(_STRONGER)) as advance:
+        first = error_of(_FIRST)
+        advance()
+        for weights in (_WEAKER, _STRONGER):
+            # A copy, as steps overwrite their state.
+            state, before = jax.tree.map(jnp.copy, first), _FIRST
+            for weight in weights:
+                state, before = error_of(weight, state, before), weight
+                advance()
+                means = _mean_logs(list(errors.values()))
+                if means[-1] > means.min() + _WORSE:
+                    break
+    tried = sorted(errors)
+    errors = np.array([errors[weight] for weight in tried])
+    rms = np.sqrt(errors.mean(axis=1) / max(float(np.mean(_squares((1 - kept) * light))), _TINY))
+    # An edge has 1 / side as many binned pixels, an area 1 / side^2.
+    scaled = tuple(side * weight for weight in tried)
+    best = int(_mean_logs(errors).argmin())
+    return Smoothness(scaled[best], scaled, tuple(rms.tolist()))
+
+
+def held_out_squares(shape: tuple[int, ...]) -> Float32[np.ndarray, "row column"]:
+    """0 in squares that are held out, a square in each cell at a pseudo-random place, and 1 elsewhere."""
+    side, rng, kept = _square_side(shape), np.random.default_rng(0), np.ones(shape, np.float32)
+    cell = _DISTANCE * side
+    for corner in np.ndindex(*(-(-n // cell) for n in shape)):
+        row, column = cell * np.array(corner) + rng.integers(0, cell - side, 2, endpoint=True)
+        kept[row : row + side, column : column + side] = 0
+    return kept
+
+
+def _square_side(shape):
+    return max(min(_SIDE, min(shape) // _LEAST_SQUARES), 1)
+
+
+def _squares(error):
+    """Sum of the squares of an error in each cell."""
+    cell = _DISTANCE * _square_side(error.shape)
+    rows, columns = (range(0, n, cell) for n in error.shape)
+    return np.add.reduceat(np.add.reduceat(error.astype(np.float64) ** 2, rows, 0), columns, 1).ravel()
+
+
+def _mean_logs(errors):
+    """Mean logarithm of the cells' errors with each weight; cells without light have no tiny ones."""
+    errors = np.asarray(errors)
+    floor = _FLOOR * errors.mean(axis=1).min()
+    return np.log(errors + max(floor, _TINY)).mean(axis=1)
+
+
+def _binning(image_shape, psf_shape):
+    """The least side of squares of pixels with which the scene has few enough voxels."""
+    voxels = psf_shape[0] * math.prod(n + k for n, k in zip(image_shape, psf_shape[1:], strict=True))
+    side = math.ceil(math.sqrt(voxels / _VOXELS))
+    return max(min(side, min(*image_shape, *psf_shape[1:]) // 2), 1)
+
+
+def _binned(light, side):
+    """The mean of squares of pixels, with noise added so that it is as large as that of a single pixel."""
+    if side == 1:
+        return light
+    mean = sum_pixels(light, side) / np.float32(side**2)
+    missing = binned_variance(light, mean.shape) / side**2 * (1 - 1 / side**2)
+    noise = np.random.default_rng(0).standard_normal(mean.shape, np.float32)
+    return mean + noise * np.sqrt(missing).astype(np.float32)
+
+
+@jax.jit
+def image_of(system, scene):
+    """The image of a scene."""
+    return system.mv(scene)

@@ -1,17 +1,17 @@
 """The inverse problem of iterative methods: light to explain, in pixels as wide as voxels, its noise, the operator."""
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Float64, Shaped
 
 from ..base.arrays import array_namespace, check_finite, is_traced, native
 from ..base.progress import Progress
-from ..detection.background import background_tiles, interpolate_tiles, level_of_tiles
+from ..detection.background import background_tiles, interpolate_tiles
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
@@ -45,9 +45,7 @@ def prepare_data(image: Image, problem: "InverseProblem") -> tuple[Any, Any]:
     light = sum_pixels(subtract_offset(xp.asarray(image, problem.imager.sensor_distance.dtype)), problem.binning)
     if not problem.is_partial:
         return light, 0.0
-    if xp is jnp:
-        return light, jnp.maximum(level_of_tiles(light), 0)
-    return light, np.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0)
+    return light, xp.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0)
 
 
 def sum_pixels(image: Any, side: int) -> Any:
@@ -172,18 +170,37 @@ class InverseProblem(eqx.Module):
         return ImagingOperator(self.imager, self.grid, self.optics)
 
     @property
-    def least_squares(self) -> "InverseProblem":
-        """The operator for least squares, whose `T` is its adjoint."""
-        return dataclasses.replace(self, back_projections=None)
-
-    @property
     def T(self) -> "BackOperator":
         return BackOperator(self)
 
     def mv(self, vector: Float[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
         """The image of a volume, without the low modes where `T` is the adjoint."""
-        image = self.imaging.mv(vector)
-        return self.keep(image if self.back_projections else self.detrend(image))
+        return self.project(vector, not self.back_projections)
+
+    def project(self, volume: Float[Array | np.ndarray, "depth y x"], exact: Any) -> Float[Array, "row column"]:
+        """The image of a volume; if `exact`, which may be traced, without the modes that least squares leave out."""
+        image = self.imaging.mv(volume)
+        return self.keep(jnp.where(exact, self.detrend(image), image))
+
+    def project_back(self, image: Float[Array | np.ndarray, "row column"], exact: Any) -> Float[Array, "depth y x"]:
+        """The volume of an image by back-projection; if `exact`, by the adjoint of `project`."""
+        image = self.keep(image)
+
+        def adjoint() -> Any:
+            return self.imaging.T.mv(self.detrend(image))
+
+        def back_project() -> Any:
+            volume: Any = 0
+            for view in self.back_projections or ():
+                # With the pixels of this problem, which may be binned.
+                binned = eqx.tree_at(lambda i: i.sensor, view.imager, self.imager.sensor)
+                part = BackprojectionOperator(binned, self.grid, distortion=view.distortion).mv(image)
+                volume = part if view.weight is None else volume + jnp.asarray(view.weight, part.dtype) * part
+            return volume
+
+        if isinstance(exact, bool):
+            return adjoint() if exact else back_project()
+        return lax.cond(exact, adjoint, back_project)
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return self.imaging.in_structure()
@@ -204,22 +221,13 @@ class InverseProblem(eqx.Module):
 
 
 class BackOperator(eqx.Module):
-    """The adjoint of an inverse problem, or the back-projections by each type of lens, weighted."""
+    """Back-projection of an inverse problem, or its adjoint."""
 
     T: InverseProblem
 
     def mv(self, vector: Float[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
-        problem, image = self.T, self.T.keep(vector)
-        if not problem.back_projections:
-            return problem.imaging.T.mv(problem.detrend(image))
-        volume: Any = 0
-        for view in problem.back_projections:
-            # With the pixels of this problem, which may be binned.
-            binned = eqx.tree_at(lambda i: i.sensor, view.imager, problem.imager.sensor)
-            part = BackprojectionOperator(binned, problem.grid, distortion=view.distortion).mv(image)
-            volume = part if view.weight is None else volume + jnp.asarray(view.weight, part.dtype) * part
-        return volume
+        return self.T.project_back(vector, not self.T.back_projections)
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return self.T.out_structure()

@@ -117,6 +117,18 @@ METHODS: dict[str, Callable[[int], Method]] = {
 }
 
 
+def method_by_name(
+    methods: dict[str, Callable[[int], Any]], name: str, steps: int, options: dict[str, float | None]
+) -> Any:
+    """The method of a name with the options that are not None; `InputError` if it lacks one."""
+    method, given = methods[name](steps), {option: value for option, value in options.items() if value is not None}
+    for option in given:
+        if not hasattr(method, option):
+            allowed = ", ".join(other for other, make in methods.items() if hasattr(make(1), option))
+            raise InputError(f"--{option.replace('_', '-')} must be used with {allowed}, got --method {name}.")
+    return dataclasses.replace(method, **given)
+
+
 def check_stop(method: Method, stop_at_discrepancy: bool) -> None:
     """Raise `InputError` if a method cannot stop at the noise: it has no steps, or steps that belong together."""
     if stop_at_discrepancy and isinstance(method, BackProjection | Unrolled | Surface):
@@ -214,7 +226,7 @@ def reconstruct(
     >>> print(grid.to_mm(peak).round(6))  # the point's position, mm
     [ 0.2 -0.1 20. ]
     """
-    check_call(image, imager, grid, method, optics)
+    check_call(image, imager, method, optics)
     options = {"stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
     return Reconstructor(imager, grid, method, optics, **options)(image, progress)
 
@@ -386,7 +398,7 @@ class Reconstructor(eqx.Module):
         return _quotient(total(kept * image, method.normalize), total(kept, True))
 
 
-def check_call(image: Image, imager: Imager, grid: Grid, method: Method, optics: Optics | str) -> None:
+def check_call(image: Image, imager: Imager, method: Method, optics: Optics | str) -> None:
     """Raise the errors of `reconstruct` that need no computation."""
     _check_image(image, imager.sensor.shape)
     _check(method, optics)

@@ -18,7 +18,7 @@ from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
 from .networks import read_unrolled
-from .pipeline import METHODS, PIXELS_PER_VOXEL, STEPPED, Method, Reconstructor, voxel_grid
+from .pipeline import METHODS, PIXELS_PER_VOXEL, STEPPED, Method, Reconstructor, method_by_name, voxel_grid
 from .residual import CrossValidation, ForwardResidual, cross_validated, forward_residual
 from .surface_fit import SurfaceFit, follow_sheets
 
@@ -98,7 +98,8 @@ class Plan:
                 raise InputError(f"{option} must be used with {', '.join(STEPPED)}, got --method {method}.")
         if warm_start and method not in ("list-rl", "richardson-lucy"):
             raise InputError(f"--warm-start must be used with list-rl or richardson-lucy, got --method {method}.")
-        solver = _method(method, _STEPS if steps is None else steps, weights, method_options)
+        methods = METHODS | ({"unrolled": lambda steps: read_unrolled(weights)} if weights else {})
+        solver = method_by_name(methods, method, _STEPS if steps is None else steps, method_options)
         grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
         return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights, warm_start)
 
@@ -179,17 +180,6 @@ class Plan:
         """How well lenses are predicted from the others, without suppression; `InputError` with sheets."""
         options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
         return cross_validated(image, self.imager, self.grid, self.method, **options, progress=progress)
-
-
-def _method(name: str, steps: int, weights: Path | None, options: dict[str, float | None]) -> Any:
-    """The method of a name with the options that are given; `InputError` if it lacks one."""
-    method: Any = read_unrolled(weights) if weights and name == "unrolled" else METHODS[name](steps)
-    given = {option: value for option, value in options.items() if value is not None}
-    for option in given:
-        if not hasattr(method, option):
-            names = [other for other, make in METHODS.items() if hasattr(make(1), option)]
-            raise InputError(f"--{option} must be used with {', '.join(names)}, got --method {name}.")
-    return dataclasses.replace(method, **given)
 
 
 class LastVolume(NamedTuple):

@@ -93,7 +93,7 @@ def fit_radius(
     if len(images) == 0:
         raise InputError("there must be a capture or more to fit the radius to, got none.")
     for image in images:
-        check_scored(image, imager, grid, method, optics)
+        check_scored(image, imager, method, optics)
     progress, images = progress or Progress(), images[:: math.ceil(len(images) / _CAPTURES)]
     part, fine, cut, judged = _middle(imager, grid.depths, _FINER * grid.pitch)
     folds = kept_pixels_of_folds(part, min(_FOLDS, len(part.centers)))

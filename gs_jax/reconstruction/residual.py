@@ -186,7 +186,7 @@ def cross_validated(
     True (3,)
     """
     check_stop(method, stop_at_discrepancy)
-    check_scored(image, imager, grid, method, optics)
+    check_scored(image, imager, method, optics)
     progress = progress or Progress()
     options = {"stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
     problem = prepare_model(imager, grid, optics, progress)
@@ -207,9 +207,9 @@ def cross_validated(
     )
 
 
-def check_scored(image, imager, grid, method, optics):
+def check_scored(image, imager, method, optics):
     """Raise the errors of `cross_validated` that need no computation."""
-    check_call(image, imager, grid, method, optics)
+    check_call(image, imager, method, optics)
     if isinstance(method, Surface):
         raise InputError("method must be one of free voxels to be scored by other lenses, got Surface().")
 

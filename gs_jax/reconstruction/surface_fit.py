@@ -100,7 +100,7 @@ def fit_surface(
     """
     if not isinstance(method, Surface):
         raise InputError(f"method must be a Surface(), got {short_repr(method)}.")
-    check_call(image, imager, grid, method, optics)
+    check_call(image, imager, method, optics)
     progress = progress or Progress()
     return fit_sheets(Reconstructor(imager, grid, method, optics, progress=progress), image, progress)[0]
 

@@ -29,7 +29,16 @@ from jaxtyping import Array, Float, Num
 from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
 from ..typing import Image, Real
-from .base import Operator, as_image, check_options, differences, differences_adjoint, lambda_max, magnitude
+from .base import (
+    Operator,
+    as_image,
+    check_options,
+    differences,
+    differences_adjoint,
+    lambda_max,
+    shrink,
+    total_variation,
+)
 
 # The penalty changes by a factor where one residual is this many times the other (Boyd, section 3.4.1), and only so
 # many times: convergence is proven for a penalty that is constant from some step on.
@@ -110,19 +119,6 @@ def _balanced(rho: Array, squares: Float[Array, "5"], changes: Array) -> tuple[P
     return Penalty(rho, factor, changes - (factor != 1).astype(changes.dtype)), jnp.maximum(primal, dual)
 
 
-def total_variation(u: Float[Array, " axis *shape"], *, isotropic: bool) -> Float[Array, ""]:
-    """Sum of the gradient's lengths (isotropic) or of the absolute values of the differences `u`."""
-    return jnp.sum(magnitude(u) if isotropic else jnp.abs(u))
-
-
-def shrink(u: Float[Array, " axis *shape"], threshold, *, isotropic: bool) -> Float[Array, " axis *shape"]:
-    """Proximal map of `threshold * total_variation`: soft thresholding of vectors (isotropic) or of components."""
-    if not isotropic:
-        return u - jnp.clip(u, -threshold, threshold)
-    length = magnitude(u)
-    return u * divide(jnp.maximum(length - threshold, 0), length)[None]
-
-
 class Iterate(NamedTuple):
     """A volume `x` with `A x` and `A'A x`, so that a step of conjugate gradients applies `A` and `A'` once."""
 
@@ -146,11 +142,10 @@ class ADMM(eqx.Module):
 
     *Differentiable.*
 
-    Conjugate gradients solve the x-step from the last `x`; each applies the operator and its adjoint once. The steps
-    are over-relaxed, and the penalty starts at the mean diagonal entry of `A'A` and adapts to the primal and dual
-    residuals (Boyd, sections 3.4.1 and 3.4.3). The residual is the larger of these two, each relative (Boyd, section
-    3.3). Costs are those of the unconstrained `x`, which may be slightly negative before convergence; the estimate is
-    not.
+    Conjugate gradients solve the x-step from the last `x`; each applies the operator and its adjoint once. The penalty
+    starts at the mean diagonal entry of `A'A` and adapts to the primal and dual residuals (Boyd, section 3.4.1). The
+    residual is the larger of these two, each relative. Costs are those of the unconstrained `x`, which may be slightly
+    negative before convergence; the estimate is not.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num, PyTree
 
-from ..base.arrays import check_real, native, safe_sqrt
+from ..base.arrays import check_real, divide, native, safe_sqrt
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 
@@ -29,9 +29,9 @@ _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 class Operator(Protocol):
     """Interface of a linear operator: those of `lineax` have it.
 
-    An operator may have two more attributes. `kept` is 1 for pixels that count and 0 for others, where its images are
-    0; None keeps all. `least_squares` is the operator for least squares, whose `T` is the exact adjoint, where `T` of
-    the operator itself is a back-projection that is not.
+    An operator may have more attributes. `kept` is 1 for pixels that count and 0 for others, where its images are 0;
+    None keeps all. Where `T` is a back-projection that is not the adjoint, `project(volume, exact)` and
+    `project_back(image, exact)` are, with a traced `exact`, the operator for least squares and its adjoint.
     """
 
     @property
@@ -55,6 +55,16 @@ class Operator(Protocol):
 def kept_pixels(A: Operator) -> Float[Array, "..."] | None:
     """1 for pixels that an operator keeps and 0 for others; None if it keeps all."""
     return getattr(A, "kept", None)
+
+
+def project(A: Any, volume: Array, *, exact: Any) -> Array:
+    """`A.mv`, or the image by the operator for least squares where `exact`, which may be traced, is true."""
+    return A.project(volume, exact) if hasattr(A, "project") else A.mv(volume)
+
+
+def project_back(A: Any, image: Array, *, exact: Any) -> Array:
+    """`A.T.mv`, or the adjoint of the operator for least squares where `exact` is true."""
+    return A.project_back(image, exact) if hasattr(A, "project_back") else A.T.mv(image)
 
 
 @runtime_checkable
@@ -370,3 +380,16 @@ def magnitude(u: Float[Array, " axis *shape"]) -> Float[Array, "*shape"]:
     """Length of the gradient vector at each voxel; its derivative is 0 where the length is 0."""
     # A sum over an axis of two or three is slower than two or three terms.
     return safe_sqrt(sum((part * part for part in u), jnp.zeros(u.shape[1:], u.dtype)))
+
+
+def total_variation(u: Float[Array, " axis *shape"], *, isotropic: bool) -> Float[Array, ""]:
+    """Sum of the gradient's lengths (isotropic) or of the absolute values of the differences `u`."""
+    return jnp.sum(magnitude(u) if isotropic else jnp.abs(u))
+
+
+def shrink(u: Float[Array, " axis *shape"], threshold, *, isotropic: bool) -> Float[Array, " axis *shape"]:
+    """Proximal map of `threshold * total_variation`: soft thresholding of vectors (isotropic) or of components."""
+    if not isotropic:
+        return u - jnp.clip(u, -threshold, threshold)
+    length = magnitude(u)
+    return u * divide(jnp.maximum(length - threshold, 0), length)[None]

@@ -131,18 +131,12 @@ class RichardsonLucy(eqx.Module):
         self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = jnp.maximum(as_image(A, image), 0)
-        x, sensitivity, momentum, knots = state
-        point = extrapolate(state)
-        background = jnp.asarray(self.background, image.dtype)
-        expected = jnp.maximum(A.mv(point) + background + bilinear_background(knots, image), 0)
-        # An FFT's rounding must not turn a dark pixel into a huge ratio.
-        ratio = divide(image, expected, jnp.finfo(image.dtype).eps * lax.stop_gradient(expected.max()))
-        scale = sensitivity if self.tv is None else sensitivity * _tv_denominator(point, self.tv)
-        new = divide(point * jnp.maximum(A.T.mv(ratio), 0), scale)
-        momentum = momentum_after(new, point, x, momentum)
-        residual = divide(norm(new - x), norm(new))
-        state = State(new, sensitivity, momentum, background_step(knots, ratio, kept_pixels(A)))
-        return state, kl_divergence(image, expected), residual
+        point, background = extrapolate(state), jnp.asarray(self.background, image.dtype)
+        expected, ratio = ratio_to_expected(image, A.mv(point) + background + bilinear_background(state.knots, image))
+        back = A.T.mv(ratio)
+        back = back if self.tv is None else divide(back, _tv_denominator(point, self.tv))
+        new = multiplied(state, point, ratio, back, kept_pixels(A))
+        return new, kl_divergence(image, expected), divide(norm(new.x - state.x), norm(new.x))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
@@ -211,12 +205,26 @@ def extrapolate(state: State) -> Float[Array, "..."]:
     return jnp.maximum(state.x + gain * (state.x - last), 0)
 
 
-def momentum_after(new, point, x, momentum):
-    """Momentum after a step from `point` to `new`; `x` is the estimate before."""
-    if not momentum:
-        return None
-    update, last = new - point, momentum[1]
-    return x, update, jnp.clip(divide(jnp.vdot(update, last), jnp.vdot(last, last)), 0, 1)
+def ratio_to_expected(image: Float[Array, "..."], shown: Float[Array, "..."]) -> tuple[Array, Array]:
+    """The expected image, which is not negative, and the ratio of the measured image to it."""
+    expected = jnp.maximum(shown, 0)
+    # An FFT's rounding must not turn a dark pixel into a huge ratio.
+    return expected, divide(image, expected, jnp.finfo(image.dtype).eps * lax.stop_gradient(expected.max()))
+
+
+def multiplied(
+    state: State,
+    point: Float[Array, "*shape"],
+    ratio: Float[Array, "..."],
+    back: Float[Array, "*shape"],
+    kept: Float[Array, "..."] | None = None,
+) -> State:
+    """State after the step from `point = extrapolate(state)` by the back-projected ratio."""
+    new, momentum = divide(point * jnp.maximum(back, 0), state.sensitivity), state.momentum
+    if momentum:
+        update, last = new - point, momentum[1]
+        momentum = state.x, update, jnp.clip(divide(jnp.vdot(update, last), jnp.vdot(last, last)), 0, 1)
+    return State(new, state.sensitivity, momentum, background_step(state.knots, ratio, kept))
 
 
 def _without_rounding(sensitivity):

@@ -24,11 +24,11 @@ from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
     State as LucyState,
-    background_step,
     bilinear_background,
     extrapolate,
     hat_functions,
-    momentum_after,
+    multiplied,
+    ratio_to_expected,
 )
 
 # Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end;
@@ -180,15 +180,14 @@ class Surface(eqx.Module):
         )
         volume, background = lax.switch(kind, inputs)
         shown = A.mv(volume) + bilinear_background(background, light)
-        expected, residual = jnp.maximum(shown, 0), light - shown
+        residual, (_, ratio) = light - shown, ratio_to_expected(jnp.maximum(light, 0), shown)
         variance = jnp.mean(residual**2)
         inverse = jnp.where(kind == _LINEARISE, divide(jnp.ones_like(variance), variance), state.inverse)
         state = state._replace(inverse=inverse)
-        rounding = jnp.finfo(light.dtype).eps * expected.max()
         pulled = lax.switch(
             jnp.minimum(kind, _PROBE),
             (
-                lambda: divide(jnp.maximum(light, 0), expected, rounding),
+                lambda: ratio,
                 lambda: state.inverse * residual,
                 lambda: state.inverse * shown,
             ),
@@ -202,10 +201,7 @@ class Surface(eqx.Module):
             return part._replace(background=rows.T @ pulled @ columns)
 
         def after_lucy():
-            x, sensitivity, momentum, _ = state.lucy
-            new = divide(volume * jnp.maximum(back, 0), sensitivity)
-            momentum = momentum_after(new, volume, x, momentum)
-            lucy = LucyState(new, sensitivity, momentum, background_step(background, pulled))
+            lucy = multiplied(state.lucy, volume, pulled, back)
             sheets = lax.cond(
                 following == _LUCY, lambda: state.sheets, lambda: first_sheets(lucy.x, lucy.knots, self.sheets)
             )

@@ -6,6 +6,7 @@ Richardson-Lucy factor is raised to a trained power, and a network weighs each v
 steps are conjugate gradients of least squares, weighted by the brightness found so far.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,14 +19,17 @@ from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 from ..base.arrays import divide
 from ..base.errors import InputError
 from ..base.weights import shipped_weights
-from .base import Operator, as_image, blurred, check_options, kept_pixels, norm
+from .base import Operator, as_image, blurred, check_options, kept_pixels, norm, project, project_back
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
     State as LucyState,
     background_step,
     bilinear_background,
+    extrapolate,
     kl_divergence,
+    multiplied,
+    ratio_to_expected,
 )
 
 # Input channels of a network: the voxel after and before the step, the maximum and the mean over its column, the
@@ -40,6 +44,8 @@ _MAX_FACTOR = 20.0
 # Rows of voxels that a network processes at once, which bounds the memory.
 _ROWS = 128
 _MAX_STEPS, _MAX_WIDTH = 64, 1024
+# Kinds of steps: Richardson-Lucy, with a network, preparation of conjugate gradients, and these.
+_NETWORK, _START, _GRADIENT = 1, 2, 3
 _LUCY = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS)
 
 
@@ -140,40 +146,71 @@ class Unrolled(eqx.Module):
     def step(
         self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+        """Next state, the cost before it, and the relative change.
+
+        The first conjugate gradient follows a step that prepares them. The operator is compiled once for all kinds.
+        """
         light = as_image(A, image)
-        image = jnp.maximum(light, 0)
+        last = self.first + self.power.size
+        kind = jnp.sum(state.number >= jnp.array([self.first, last, last], jnp.int32))
 
-        def lucy_step(state):
-            lucy, cost, residual = _LUCY.step(A, image, state.lucy)
-            return state._replace(lucy=lucy), cost, residual
+        def advance(carry, step):
+            needed = (step == kind) | ((step == _START) & (state.number == last))
+            return lax.cond(needed, lambda: self._advance(A, light, carry[0], kind=step), lambda: carry), None
 
-        def network_step(state):
-            lucy, cost, residual = self.network_step(A, image, state)
-            return state._replace(lucy=lucy), cost, residual
-
-        def gradient_step(state):
-            start = lambda: _start_gradients(A, light, state.lucy)
-            gradients = lax.cond(state.number == ends[1], start, lambda: state.gradients)
-            gradients, cost, residual = _gradient_step(A, gradients)
-            return state._replace(gradients=gradients), cost, residual
-
-        ends = jnp.array([self.first, self.first + self.power.size], jnp.int32)
-        kind = jnp.sum(state.number >= ends)
-        state, cost, residual = lax.switch(kind, (lucy_step, network_step, gradient_step), state)
+        zero = jnp.zeros((), state.lucy.x.dtype)
+        steps = jnp.stack([jnp.array(_START, kind.dtype), kind])
+        (state, cost, residual), _ = lax.scan(advance, (state, zero, zero), steps)
         return state._replace(number=state.number + 1), cost, residual
 
     def network_step(
         self, A: Operator, image: Float[Array, "..."], state: State
-    ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
-        """Take a step with a network; return the new estimate, the cost of the old one, and the relative change."""
+    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+        """Take a step with a network, for training: `step` would keep what gradients of its other kinds need."""
+        return self._advance(A, image, state, kind=_NETWORK)
+
+    def _advance(self, A, light, state, *, kind):
+        """Take a step of some kind, traced or not, with one image of a volume and one volume of an image."""
+        choose = (lambda options: options[kind]()) if isinstance(kind, int) else partial(lax.switch, kind)
+        image, lucy, gradients = jnp.maximum(light, 0), state.lucy, state.gradients
+        current = lambda: lucy.x
+        volume = choose((lambda: extrapolate(lucy), current, current, lambda: gradients.variance * gradients.direction))
+        shown = project(A, volume, exact=kind == _GRADIENT)
+        background, kept = bilinear_background(lucy.knots, image), kept_pixels(A)
+        expected, ratio = ratio_to_expected(image, shown + background)
+        faint = divide(image, expected + _FAINT * jnp.mean(image))
+        pulled = choose((lambda: ratio, lambda: faint, lambda: light, lambda: shown))
+        back = project_back(A, pulled, exact=kind >= _START)
+
+        def multiplied_by(new):
+            change = divide(norm(new.x - lucy.x), norm(new.x))
+            return state._replace(lucy=new), kl_divergence(image, expected), change
+
+        def after_start():
+            new = _first_gradient(lucy, light, light - shown - background, back, kept)
+            return state._replace(gradients=new), new.cost, jnp.ones_like(new.cost)
+
+        def after_gradient():
+            new, change = _next_gradient(gradients, volume, shown, back)
+            return state._replace(gradients=new), gradients.cost, change
+
+        after_lucy = lambda: multiplied_by(multiplied(lucy, volume, ratio, back, kept))
+        after_network = lambda: multiplied_by(self._weighed(state, faint, back, kept))
+        return choose((after_lucy, after_network, after_start, after_gradient))
+
+    def _weighed(self, state, ratio, back, kept) -> LucyState:
+        """The estimate after a step by the back-projected ratio, weighed by a network."""
         (x, sensitivity, momentum, knots), number = state.lucy, state.number - self.first
-        expected = jnp.maximum(A.mv(x) + bilinear_background(knots, image), 0)
-        ratio = divide(image, expected + _FAINT * jnp.mean(image))
-        factor = jnp.clip(divide(A.T.mv(ratio), sensitivity), 1 / _MAX_FACTOR, _MAX_FACTOR)
+        factor = jnp.clip(divide(back, sensitivity), 1 / _MAX_FACTOR, _MAX_FACTOR)
         ahead = x * factor ** self.power[number].astype(x.dtype)
         unit = _rms(ahead)
-        in_unit = lambda volume, unit: jnp.arcsinh(divide(volume, jnp.broadcast_to(unit, volume.shape)))
-        column = lambda reduce: in_unit(jnp.broadcast_to(reduce(ahead, axis=0, keepdims=True), x.shape), unit)
+
+        def in_unit(volume, unit):
+            return jnp.arcsinh(divide(volume, jnp.broadcast_to(unit, volume.shape)))
+
+        def column(reduce):
+            return in_unit(jnp.broadcast_to(reduce(ahead, axis=0, keepdims=True), x.shape), unit)
+
         channels = [
             in_unit(ahead, unit),
             in_unit(x, unit),
@@ -185,8 +222,7 @@ class Unrolled(eqx.Module):
         ]
         layers = jax.tree.map(lambda leaf: leaf[number], self.layers)
         new = ahead * 2 * jax.nn.sigmoid(_apply_network(layers, jnp.stack(channels, -1)))
-        lucy = LucyState(new, sensitivity, momentum, background_step(knots, ratio, kept_pixels(A)))
-        return lucy, kl_divergence(image, expected), divide(norm(new - x), norm(new))
+        return LucyState(new, sensitivity, momentum, background_step(knots, ratio, kept))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         gradients = state.gradients
@@ -231,38 +267,25 @@ def initialize_unrolled(
     return Unrolled(tuple(layers), jnp.full(networks, 1.3, jnp.float32), first, last, first + networks + last)
 
 
-def _start_gradients(A, image, lucy: LucyState) -> ConjugateGradients:
+def _first_gradient(lucy: LucyState, image, misfit, back, kept) -> ConjugateGradients:
+    """State before the first conjugate gradient; `back` is `A' image`, and `misfit` what `lucy` leaves of the image."""
     x = lucy.x
-    residual_image = image - A.mv(x) - bilinear_background(lucy.knots, image)
     # Where light is likely, it is likely in neighbours, too.
     variance = blurred(x) * divide(jnp.vdot(x, x), jnp.sum(x))
-    residual = _least_squares_operator(A).T.mv(image)
-    product = jnp.vdot(residual, variance * residual)
-    noise, cost = jnp.mean(residual_image**2, where=_where_kept(A)), jnp.vdot(image, image) / 2
-    return ConjugateGradients(jnp.zeros_like(x), residual, residual, variance, noise, product, cost)
+    product, noise = jnp.vdot(back, variance * back), jnp.mean(misfit**2, where=None if kept is None else kept > 0)
+    return ConjugateGradients(jnp.zeros_like(x), back, back, variance, noise, product, jnp.vdot(image, image) / 2)
 
 
-def _gradient_step(A, state: ConjugateGradients):
-    """Take one conjugate gradient; return the next state, the cost before it, and the relative change."""
-    A = _least_squares_operator(A)
+def _next_gradient(state: ConjugateGradients, step, image, back):
+    """State after a conjugate gradient, and the relative change; `image` is that of `step`, and `back` `A' image`."""
     weights, residual, direction, variance, noise, product, cost = state
-    step = variance * direction
-    image = A.mv(step)
     length = divide(product, jnp.vdot(image, image) + noise * jnp.vdot(direction, step))
     weights = weights + length * direction
-    residual = residual - length * (A.T.mv(image) + noise * direction)
+    residual = residual - length * (back + noise * direction)
     new = jnp.vdot(residual, variance * residual)
     direction = residual + divide(new, product) * direction
     after = ConjugateGradients(weights, residual, direction, variance, noise, new, cost - length * product / 2)
-    return after, cost, divide(norm(length * step), norm(variance * weights))
-
-
-def _where_kept(A: Operator) -> Array | None:
-    return None if (kept := kept_pixels(A)) is None else kept > 0
-
-
-def _least_squares_operator(A: Operator) -> Operator:
-    return getattr(A, "least_squares", A)
+    return after, divide(norm(length * step), norm(variance * weights))
 
 
 def _rms(x):
