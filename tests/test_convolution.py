@@ -288,7 +288,7 @@ def test_the_deconvolve_command(tmp_path):
     assert read_capture(tmp_path / "s.tif").shape == image.shape
     assert {"input c.tif", "input psf.npy"} < set(read_provenance(tmp_path / "s.tif"))
     wrong = CliRunner().invoke(commands, [*arguments, "--method", "fista", "--tv", "0.1", *output]).exception
-    assert isinstance(wrong, InputError) and "--tv must be used with admm, richardson-lucy, got --method fista" in str(wrong)
+    assert isinstance(wrong, InputError) and "--tv must be used with admm, richardson-lucy, got" in str(wrong)
 
 
 def test_the_command_says_how_well_the_scene_was_found(tmp_path):
