@@ -286,8 +286,8 @@ def deconvolve_command(
     from ..io.recordings import spot_names
     from ..io.volumes import STACK_SUFFIXES, write_planes
     from ..reconstruction.deconvolution import SOLVERS, bin_pixels, filter_image, pad_to_largest, run_deconvolution
-    from ..reconstruction.pipeline import method_by_name
     from ..reconstruction.field_fit import fit_field
+    from ..reconstruction.pipeline import method_by_name
 
     files = [path for path in (*psf, psf_places, *camera.files) if path]
     check_outputs(output, STACK_SUFFIXES, inputs=(capture, *files))
