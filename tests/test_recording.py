@@ -424,12 +424,3 @@ def test_depths_on_three_devices(folder):
         one, three = (np.load(folder / f"{devices}-{count}.npy") for devices in (1, 3))
         # Float32: a program of other shapes rounds otherwise.
         np.testing.assert_allclose(three, one, rtol=1e-5, atol=1e-5 * one.max())
-
-
-@pytest.mark.integration
-def test_a_recording_on_two_devices(folder):
-    save("rec.tif", FRAMES[:2])
-    for devices in (1, 2):
-        on_devices(devices, "-m", "gs_jax", *command("rec.tif", output=f"{devices}.zarr"))
-    one, two = volumes("1.zarr"), volumes("2.zarr")
-    np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-5 * one.max())

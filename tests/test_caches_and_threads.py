@@ -1,6 +1,7 @@
-"""Arrays that are kept for the next process."""
+"""Results that are kept in memory and on disk; work in threads: in order, and its errors are the caller's."""
 
 import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from gs_jax.base import caches
 from gs_jax.base.caches import cache_by_value, cached_on_disk
+from gs_jax.base.workers import map_in_threads
 
 
 class Counted:
@@ -88,3 +90,20 @@ def test_results_are_kept_for_arguments_of_the_same_values():
     np.testing.assert_array_equal(twice({"a": np.arange(3)}), [0, 2, 4])
     np.testing.assert_array_equal(twice({"a": np.arange(3.0)}, scale=3), [0, 3, 6])
     assert calls == [2, 2, 3] and twice({"a": np.arange(3.0)}) is not first
+
+
+def test_results_of_threads_are_in_the_order_of_the_items():
+    first_may_end = threading.Event()
+
+    def work(item):
+        # Of two threads at least, the second ends first; a single one must not wait for itself.
+        if item == 0:
+            first_may_end.wait(0.2)
+        first_may_end.set()
+        return item**2
+
+    assert list(map_in_threads(work, range(20))) == [item**2 for item in range(20)] and not list(
+        map_in_threads(str, [])
+    )
+    with pytest.raises(ZeroDivisionError):
+        list(map_in_threads(lambda item: 1 / item, [1, 0, 2]))
