@@ -161,10 +161,10 @@ def _lines(task: _Task, rate: str, words: Callable[[], str] | None) -> Iterator[
         nonlocal last
         last, taken, done = now, now - began, task.done
         left = (task.total or done) - done
-        each = task.seconds_each if done > 1 else taken
+        seconds = task.seconds_each if done > 1 else taken
         of, digits = f" of {task.total}" if task.total else "", 0 if taken >= _EVERY else 2
         per_second = f", {done / taken:.3g} {rate}/s" if rate and taken > 0 else ""
-        time_left = f", about {each * left:.0f} s left" if left and done else ""
+        time_left = f", about {seconds * left:.0f} s left" if left and done else ""
         more = f", {words()}" if words else ""
         say(f"gs-jax: {task.description}: {done}{of}, {taken:.{digits}f} s{per_second}{more}{time_left}")
 

@@ -85,11 +85,11 @@ class Workers:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        for each in (self._client, self._cluster):
+        for connection in (self._client, self._cluster):
             # Whatever has not ended after the timeout ends with this process.
             with contextlib.suppress(TimeoutError):
-                if each is not None:
-                    each.close(timeout=_END)
+                if connection is not None:
+                    connection.close(timeout=_END)
 
     def mapper(
         self, build: Callable[[], Callable[[Item], Result]]

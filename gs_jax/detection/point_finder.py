@@ -206,7 +206,7 @@ def _candidates(rest: DetectionImage, lens_types: Sequence[LensType], voxels: Gr
     wider = [_rounded_up(count - 1, _FEW_VOXELS) + 1 for count in voxels.shape]
     beyond = (np.array([0, *wider]) - [0, *voxels.shape]) // 2
     search = Grid([1.0], wider, voxels.pitch, voxels.origin)
-    imagers, found = tuple(lens_type.imager for lens_type in lens_types), [np.zeros((0, 3))]
+    imagers, points = tuple(lens_type.imager for lens_type in lens_types), [np.zeros((0, 3))]
     for first in progress.track(range(0, last - 1, inner), "Searching for points"):
         depths = planes[np.minimum(first + np.arange(inner + 2), last)]
         distortions = tuple(lens_type.distortion_at(depths) for lens_type in lens_types)
@@ -215,8 +215,8 @@ def _candidates(rest: DetectionImage, lens_types: Sequence[LensType], voxels: Gr
         is_maximum = np.asarray(_maxima(image, imagers, part, distortions, sharp, np.array(voxels.shape)))
         # Faster than `np.argwhere` in three dimensions.
         maxima = np.stack(np.unravel_index(np.flatnonzero(is_maximum), is_maximum.shape), -1) + (first + 1, 1, 1)
-        found.append(_to_mm(voxels, (maxima - beyond)[maxima[:, 0] < last]))
-    return np.concatenate(found)
+        points.append(_to_mm(voxels, (maxima - beyond)[maxima[:, 0] < last]))
+    return np.concatenate(points)
 
 
 def _rounded_up(count: int, step: int) -> int:

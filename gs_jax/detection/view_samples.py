@@ -91,16 +91,14 @@ class LensType(NamedTuple):
 @cache_by_value(maxsize=8)
 def lens_types_of(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> tuple[LensType, ...]:
     """Split an imager by the types of its lenses, with the sharpness of each type by exact rays."""
-    each, groups = split_groups(imager)
-    distortions = [core_distortion(one, depths) for one in each]
+    imagers, groups = split_groups(imager)
+    types = [LensType(lenses, depths, core_distortion(lenses, depths)) for lenses in imagers]
     if imager.array.alike:
-        return tuple(LensType(one, depths, distortion) for one, distortion in zip(each, distortions, strict=True))
+        return tuple(types)
     bands = height_bands(imager)[[lenses[0] for lenses in groups]]
-    weights = type_weights(each, depths, core_width(imager), bands)
+    weights = type_weights(imagers, depths, core_width(imager), bands)
     best = np.stack([weights[bands == band].max(0) for band in bands])
-    return tuple(
-        LensType(*parts) for parts in zip(each, [depths] * len(each), distortions, weights / best, strict=True)
-    )
+    return tuple(t._replace(sharpness=sharpness) for t, sharpness in zip(types, weights / best, strict=True))
 
 
 def sample_views(

@@ -83,7 +83,7 @@ class Smoothness(NamedTuple):
 
 
 class Deconvolution(NamedTuple):
-    """A scene, and how well it was found.
+    """A scene, and how well it explains the capture.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def run_deconvolution(
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
 ) -> Deconvolution:
-    """As `deconvolve`, with how well the scene was found; `choose` chooses the weight of total variation."""
+    """As `deconvolve`, with how well the scene explains it; `choose` chooses the weight of total variation."""
     solver, progress = _DEFAULT if solver is None else solver, progress or Progress()
     if not isinstance(solver, Deconvolver):
         raise InputError(f"solver must be an object such as ConvolutionADMM() or FISTA(), got {short_repr(solver)}.")

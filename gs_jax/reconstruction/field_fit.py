@@ -125,15 +125,15 @@ class _Plane:
         Others on a line do not tell how the PSF changes across it: the nearest of them then stands for it.
         """
         count, total = len(self.positions), 0.0
-        for one in range(count):
-            others = np.arange(count) != one
+        for source in range(count):
+            others = np.arange(count) != source
             positions, values = self.positions[others], self.coefficients[others, : self.rank]
             if _spans(positions):
-                at = np.clip(self.positions[one], positions.min(0), positions.max(0))
-                found = _interpolate(positions, values, at[None])[0]
+                at = np.clip(self.positions[source], positions.min(0), positions.max(0))
+                predicted = _interpolate(positions, values, at[None])[0]
             else:
-                found = values[np.argmin(((positions - self.positions[one]) ** 2).sum(1))]
-            total += np.sum((found - self.coefficients[one, : self.rank]) ** 2)
+                predicted = values[np.argmin(((positions - self.positions[source]) ** 2).sum(1))]
+            total += np.sum((predicted - self.coefficients[source, : self.rank]) ** 2)
         return float(np.hypot(np.sqrt(total / np.sum(self.coefficients**2)), self.error))
 
     def components(self, rank):

@@ -131,7 +131,7 @@ def lens_type_geometries(imager: Imager, grid: Grid) -> tuple[LensTypeGeometry, 
     side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
     weights = type_weights(imagers, depths, side, bands)[..., None, None].astype(np.float32)
     pairs = zip(imagers, weights, strict=True)
-    return tuple(LensTypeGeometry(one, core_distortion(one, depths), weight) for one, weight in pairs)
+    return tuple(LensTypeGeometry(lenses, core_distortion(lenses, depths), weight) for lenses, weight in pairs)
 
 
 class InverseProblem(eqx.Module):

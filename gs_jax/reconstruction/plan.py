@@ -25,9 +25,9 @@ from .surface_fit import SurfaceFit, follow_sheets
 # Steps of an iterative method.
 _STEPS = 20
 # What an image may leave unexplained, of what the last one that took all steps left, for its steps to end.
-_ENOUGH = 1.02
+_TARGET_RATIO = 1.02
 # Relative change of the light with which an image starts afresh: it, or the one before, may be dark.
-_CHANGED = 0.5
+_COLD_CHANGE = 0.5
 
 
 class Result(NamedTuple):
@@ -201,8 +201,8 @@ def follow_volume(
     """
     light = float(np.sum(image, dtype=float))
     # No step lights a volume that is dark.
-    follows = last is not None and abs(light - last.light) < _CHANGED * last.light and bool(last.solver.x.any())
-    target = _ENOUGH * last.unexplained * light if last and follows else 0.0
+    follows = last is not None and abs(light - last.light) < _COLD_CHANGE * last.light and bool(last.solver.x.any())
+    target = _TARGET_RATIO * last.unexplained * light if last and follows else 0.0
     state = reconstructor.init(image, _restart(last.solver) if last and follows else None)
     state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
     # The divergence of counts is proportional to their sum.

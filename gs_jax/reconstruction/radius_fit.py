@@ -105,9 +105,9 @@ def fit_radius(
 
         def error(factor) -> float:
             made = with_radii(part, float(factor))
-            trials[float(factor)] = found = _prediction_error(captures, judged, made, fine, method, optics, progress)
+            trials[float(factor)] = value = _prediction_error(captures, judged, made, fine, method, optics, progress)
             advance()
-            return found
+            return value
 
         as_known = error(1.0)
         options = {"xatol": _TOLERANCE, "maxiter": _TRIALS}

@@ -295,10 +295,10 @@ class _Queue:
 
     def stamp(self, frame: int) -> _Stamp | None:
         try:
-            found = os.stat(self.folder / self.series.names[frame])
+            status = os.stat(self.folder / self.series.names[frame])
         except OSError:
             return None
-        return _Stamp(found.st_size, found.st_mtime, found.st_ino)
+        return _Stamp(status.st_size, status.st_mtime, status.st_ino)
 
     @property
     def patience(self) -> float:

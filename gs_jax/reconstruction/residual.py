@@ -85,21 +85,26 @@ def forward_residual(
 
 
 def _compare(model, light):
-    energy, rms = np.vdot(model, model), np.sqrt(np.mean(light**2))
+    energy = np.vdot(model, model)
     residual = light - (np.vdot(model, light) / energy if energy > 0 else 0) * model
     spread = model.std() * light.std()
     correlation = np.mean((model - model.mean()) * (light - light.mean())) / spread if spread > 0 else 0.0
-    # Any volume explains a dark capture.
-    regions = rms_of_regions(residual) / (rms if rms > 0 else 1)
-    error = np.sqrt(np.mean(residual**2)) / rms if rms > 0 else 0.0
-    return ForwardResidual(float(error), float(correlation), regions)
+    return ForwardResidual(relative(residual, light), float(correlation), relative_regions(residual, light))
 
 
-def rms_of_regions(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "region_row region_column"]:
-    """RMS in each of 16 x 16 regions of the sensor."""
-    first = [np.unique(np.linspace(0, n, _REGIONS, endpoint=False).astype(int)) for n in image.shape]
+def relative(residual: Float[np.ndarray, "..."], light: Float[np.ndarray, "..."]) -> float:
+    """RMS of a residual, relative to that of the light; 0 without light, which any volume explains."""
+    energy = float(np.sum(light**2))
+    return float(np.sqrt(np.sum(residual**2) / energy)) if energy > 0 else 0.0
+
+
+def relative_regions(
+    residual: Float[np.ndarray, "row column"], light: Float[np.ndarray, "row column"]
+) -> Float[np.ndarray, "region_row region_column"]:
+    """RMS of a residual in each of 16 x 16 regions of the sensor, relative to that of the light, unless it is dark."""
+    first = [np.unique(np.linspace(0, n, _REGIONS, endpoint=False).astype(int)) for n in light.shape]
     sums = lambda part: np.add.reduceat(np.add.reduceat(part, first[0], 0), first[1], 1)
-    return np.sqrt(sums(image**2) / sums(np.ones_like(image)))
+    return np.sqrt(sums(residual**2) / sums(np.ones_like(light))) / (np.sqrt(np.mean(light**2)) or 1)
 
 
 class CrossValidation(NamedTuple):
@@ -198,13 +203,9 @@ def cross_validated(
         left_out = kept == 0
         residual[left_out] = rest[left_out]
         parts.append(relative(rest[left_out], light[left_out]))
-    noise = math.sqrt(binned_variance(np.asarray(image), light.shape).mean())
-    rms = float(np.sqrt(np.mean(light**2)))
-    # Any volume predicts a dark capture.
-    regions = rms_of_regions(residual) / (rms if rms > 0 else 1)
-    return CrossValidation(
-        relative(residual, light), min(noise / rms, 1.0) if rms > 0 else 0.0, np.array(parts), regions
-    )
+    noise, rms = math.sqrt(binned_variance(np.asarray(image), light.shape).mean()), float(np.sqrt(np.mean(light**2)))
+    noise = min(noise / rms, 1.0) if rms > 0 else 0.0
+    return CrossValidation(relative(residual, light), noise, np.array(parts), relative_regions(residual, light))
 
 
 def check_scored(image, imager, method, optics):
@@ -256,9 +257,3 @@ def folds_of_lenses(centers: Float[np.ndarray, "lens 2"], count: int) -> Int[np.
         apart = np.hypot(*(centers - centers[lens]).T)
         folds[lens] = np.argmax([apart[folds == fold].min(initial=np.inf) for fold in range(count)])
     return folds
-
-
-def relative(residual: Float[np.ndarray, "..."], light: Float[np.ndarray, "..."]) -> float:
-    """RMS of a residual, relative to that of the light; 0 without light."""
-    energy = float(np.sum(light**2))
-    return float(np.sqrt(np.sum(residual**2) / energy)) if energy > 0 else 0.0

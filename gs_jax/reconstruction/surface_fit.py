@@ -21,7 +21,7 @@ from .pipeline import Reconstructor, check_call
 _DARK = 0.03
 # What one more sheet leaves unexplained, of what these leave, below which these are too few. Where they are enough it
 # was 1.03 or more, as the one more takes fewer steps, 0.85 for two sheets and 0.56 for blobs.
-_ENOUGH = 0.95
+_TOO_FEW = 0.95
 # What a fit that starts from the last one may leave unexplained, of what the last one that started afresh left.
 _CHANGED = 1.1
 
@@ -54,7 +54,7 @@ class SurfaceFit(NamedTuple):
     @property
     def warning(self) -> str | None:
         """What to say if one more sheet explains more, or free voxels do; None if not."""
-        if not (self.error > self.free_error or self.further_error < _ENOUGH * self.error):
+        if not (self.error > self.free_error or self.further_error < _TOO_FEW * self.error):
             return None
         count = len(self.depth)
         some = "a sheet leaves" if count == 1 else f"{count} sheets leave"
@@ -115,7 +115,7 @@ def fit_sheets(reconstructor: Reconstructor, image: Image, progress: Progress) -
     state = reconstructor.run(reconstructor.init(image), progress)
     fit = _maps(reconstructor, state.solver)
     further = reconstructor.by(dataclasses.replace(method, steps=RESTARTED_STEPS, sheets=method.sheets + 1))
-    start = state._replace(solver=restarted(state.solver, method.sheets + 1, afresh=True))
+    start = state._replace(solver=restarted(state.solver, method.sheets + 1, cold_start=True))
     one_more = float(further.run(start, progress).solver.errors[1])
     return fit._replace(further_error=one_more), (state.solver, fit.error)
 
@@ -130,7 +130,7 @@ def follow_sheets(
     if last is not None:
         method: Any = reconstructor.method
         short = reconstructor.by(dataclasses.replace(method, steps=RESTARTED_STEPS))
-        start = restarted(last[0], method.sheets, afresh=False)
+        start = restarted(last[0], method.sheets, cold_start=False)
         state = short.run(short.init(image, start), progress)
         fit = _maps(short, state.solver)
         if fit.error < _CHANGED * last[1]:

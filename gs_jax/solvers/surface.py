@@ -158,9 +158,7 @@ class Surface(eqx.Module):
         image = jnp.maximum(as_image(A, image), 0)
         lucy = _START.init(A, image)
         none = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda: first_sheets(lucy.x, lucy.knots, self.sheets)))
-        zeros = lambda count: jnp.zeros(count, image.dtype)
-        number = jnp.zeros((), jnp.int32)
-        return State(lucy, none, none, none, none, zeros(3), none.depth, zeros(()), zeros(2), number)
+        return _state_before(0, lucy, none, jnp.zeros((), image.dtype), jnp.zeros(2, image.dtype))
 
     def step(
         self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
@@ -184,14 +182,8 @@ class Surface(eqx.Module):
         variance = jnp.mean(residual**2)
         inverse = jnp.where(kind == _LINEARISE, divide(jnp.ones_like(variance), variance), state.inverse)
         state = state._replace(inverse=inverse)
-        pulled = lax.switch(
-            jnp.minimum(kind, _PROBE),
-            (
-                lambda: ratio,
-                lambda: state.inverse * residual,
-                lambda: state.inverse * shown,
-            ),
-        )
+        outputs = (lambda: ratio, lambda: state.inverse * residual, lambda: state.inverse * shown)
+        pulled = lax.switch(jnp.minimum(kind, _PROBE), outputs)
         back = A.T.mv(pulled)
         misfit = divide(variance, jnp.mean(light**2)) ** 0.5
 
@@ -322,10 +314,12 @@ def first_sheets(x, background, count):
 def _divided(light, depth, faint):
     """Mean depths of the light `(plane, y, x)` that is nearest to each sheet; those of faint columns hardly change."""
     k = jnp.arange(len(light), dtype=light.dtype)[:, None, None]
-    for _ in range(_LLOYD):
+
+    def improved(_, depth):
         mine = nearest(k, depth) * light[None]
-        depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint + jnp.finfo(light.dtype).tiny)
-    return depth
+        return ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint + jnp.finfo(light.dtype).tiny)
+
+    return lax.fori_loop(0, _LLOYD, improved, depth)
 
 
 def widened(x, axis):
@@ -349,18 +343,20 @@ def squared_derivatives(sheets):
     return Sheets(4 * sheets.root**2, depth, jnp.ones_like(sheets.background))
 
 
-@partial(jax.jit, static_argnames=("count", "afresh"))
-def restarted(state: State, count: int, *, afresh: bool) -> State:
-    """State after the steps of Richardson-Lucy, of so many sheets: those that they give (afresh), or the last ones."""
+@partial(jax.jit, static_argnames=("count", "cold_start"))
+def restarted(state: State, count: int, *, cold_start: bool) -> State:
+    """State from which a fit of `count` sheets starts: from the voxels of Richardson-Lucy, or from the last sheets."""
     lucy = state.lucy
-    sheets = first_sheets(lucy.x, lucy.knots, count) if afresh else state.sheets
-    none = jax.tree.map(jnp.zeros_like, sheets)
-    number = jnp.full((), _FIRST, jnp.int32)
-    new = State(
-        lucy, sheets, none, none, none, jnp.zeros_like(state.diagonal), none.depth, state.inverse, state.errors, number
-    )
+    sheets = first_sheets(lucy.x, lucy.knots, count) if cold_start else state.sheets
     # The steps overwrite their state.
-    return jax.tree.map(jnp.copy, new)
+    return jax.tree.map(jnp.copy, _state_before(_FIRST, lucy, sheets, state.inverse, state.errors))
+
+
+def _state_before(number, lucy, sheets, inverse, errors):
+    """State before a step of this number, without Hessian or change of the sheets."""
+    none = jax.tree.map(jnp.zeros_like, sheets)
+    diagonal, number = jnp.zeros(3, inverse.dtype), jnp.full((), number, jnp.int32)
+    return State(lucy, sheets, none, none, none, diagonal, none.depth, inverse, errors, number)
 
 
 def depth_of_sheets(state: State) -> tuple[Array, Array]:
