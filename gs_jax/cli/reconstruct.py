@@ -160,7 +160,7 @@ def reconstruct_command(
     if recording.warm_start and workers.remote:
         raise InputError("--warm-start must be used without --workers and --scheduler, which take frames in any order.")
     further: dict[str, Any] = {"points": points is not None, "warm_start": bool(recording.warm_start)}
-    plan = Plan.of(imager, from_array, voxel_um and voxel_um / 1000, **vars(options), **further)
+    plan = Plan.from_options(imager, from_array, voxel_um and voxel_um / 1000, **vars(options), **further)
     series = SeriesRun(capture, output, points, plan, camera, frame, microscope, recording, workers, force)
     if recording.watch:
         series.check(None)

@@ -62,7 +62,7 @@ class Plan:
     sharpness: Any = None
 
     @classmethod
-    def of(
+    def from_options(
         cls,
         imager: Imager,
         depths: list[float],

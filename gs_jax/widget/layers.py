@@ -77,7 +77,7 @@ def prepare_layers(
         raise InputError(f"Depths {error.message}") from error
     imager = read_design(design).imager()
     options = {"method": method, "suppress": suppress, "points": points}
-    plan = Plan.of(imager, planes, voxel_um / _UM or None, **options)
+    plan = Plan.from_options(imager, planes, voxel_um / _UM or None, **options)
     grid, volume_of = plan.grid, plan.prepare(progress)
 
     def reconstruct(name: str, capture: Path | np.ndarray) -> Result:
