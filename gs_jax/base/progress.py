@@ -126,11 +126,11 @@ class _Task:
         if (seconds := self.seconds_each * self.total) <= _LONG:
             return None
         memory = f"{peak_memory() / 2**30:.2g} GiB of memory"  # further parts take no more
-        quarter = f"; {self.quarter}: about {_in_words(seconds / 4)}" if self.quarter else ""
-        return f"gs-jax: {self.description}: about {_in_words(seconds)} in all, {memory}{quarter}"
+        quarter = f"; {self.quarter}: about {_format_seconds(seconds / 4)}" if self.quarter else ""
+        return f"gs-jax: {self.description}: about {_format_seconds(seconds)} in all, {memory}{quarter}"
 
 
-def _in_words(seconds: float) -> str:
+def _format_seconds(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 1.5 * _LONG else f"{seconds:.0f} s"
 
 
@@ -220,5 +220,5 @@ class CancellableProgress(Progress):
         if not task.total:
             return task.description, task.done, task.total
         left = task.seconds_each * (task.total - task.done) if task.done > 1 else 0.0
-        words = f"{task.description}: {task.done} of {task.total}" + (f", about {_in_words(left)} left" if left else "")
+        words = f"{task.description}: {task.done} of {task.total}" + (f", about {_format_seconds(left)} left" if left else "")
         return words, task.done, task.total
