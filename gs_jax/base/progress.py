@@ -220,5 +220,5 @@ class CancellableProgress(Progress):
         if not task.total:
             return task.description, task.done, task.total
         left = task.seconds_each * (task.total - task.done) if task.done > 1 else 0.0
-        words = f"{task.description}: {task.done} of {task.total}" + (f", about {_format_seconds(left)} left" if left else "")
-        return words, task.done, task.total
+        time_left = f", about {_format_seconds(left)} left" if left else ""
+        return f"{task.description}: {task.done} of {task.total}{time_left}", task.done, task.total
