@@ -20,12 +20,12 @@ from .io.volumes import read_volume as read_volume, write_volume as write_volume
 from .layers import Layers as Layers, Sample as Sample
 from .layouts import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray
+from .linear.measured_psf import ConvolutionOperator as ConvolutionOperator
 from .materials import EmissionBand as EmissionBand, refractive_index as refractive_index
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward, psf_model as psf_model
-from .projection.measured_psf import ConvolutionOperator as ConvolutionOperator
 from .projection.operators import (
     BackprojectionOperator as BackprojectionOperator,
     ImagingOperator as ImagingOperator,

@@ -14,10 +14,10 @@ from jax import export
 from jax.test_util import check_grads
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward, psf_model
+from gs_jax.linear.linear_map import compiled_for_cpu
 from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.projection import tiles
 from gs_jax.projection.bilinear import image_to_volume, rays_vjp, volume_to_image
-from gs_jax.projection.linear_map import compiled_for_cpu
 from gs_jax.projection.rays import Envelope, RingLight, Shapes
 from gs_jax.projection.stray_light import Windows, interpolate_windows
 

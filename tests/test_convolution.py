@@ -15,7 +15,7 @@ from gs_jax import ADMM, FISTA, InputError, RichardsonLucy
 from gs_jax.__main__ import commands
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.provenance import read_provenance
-from gs_jax.projection.measured_psf import ConvolutionOperator, middle, scene_size
+from gs_jax.linear.measured_psf import ConvolutionOperator, middle, scene_size
 from gs_jax.reconstruction.deconvolution import deconvolve
 from gs_jax.solvers.admm import ConvolutionADMM
 from gs_jax.solvers.base import RESULTS, solve, total_variation

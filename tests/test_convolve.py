@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 from scipy.signal import fftconvolve
 
 from gs_jax.projection.convolution import sum_of_convolutions, upsample_by_two
-from gs_jax.projection.linear_map import cpu_kernel
+from gs_jax.projection.cpu.loading import cpu_kernel
 
 
 def problem(shape=(170, 205), size=9, count=2, dtype=jnp.float32, *, symmetric=False):

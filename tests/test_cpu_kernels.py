@@ -19,9 +19,9 @@ import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 from gs_jax.optics.polar_grid import SparseTable
-from gs_jax.projection import linear_map
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
+from gs_jax.projection.cpu import loading
 from gs_jax.projection.rays import OUTSIDE, Envelope, RingLight
 from gs_jax.projection.stray_light import Windows, interpolate_windows, times_table
 
@@ -358,9 +358,9 @@ def test_float64_and_narrow_sensors_are_for_xla():
 
 
 @pytest.fixture
-def loading():
+def loading_anew():
     """Kernels are loaded anew, before and after."""
-    caches = linear_map._load, linear_map._warn
+    caches = loading._load, loading._warn
     for function in caches:
         function.cache_clear()
     yield
@@ -368,24 +368,24 @@ def loading():
         function.cache_clear()
 
 
-def test_without_numba(monkeypatch, loading):
+def test_without_numba(monkeypatch, loading_anew):
     shapes, rays, image, volume = problem(WEIGHTS[0])
     expected = run(all_three, shapes, rays, image, volume)[0]
-    linear_map._load.cache_clear()
+    loading._load.cache_clear()
     monkeypatch.setitem(sys.modules, "numba", None)  # an import that fails
-    assert linear_map.cpu_kernel("gather") is None
+    assert loading.cpu_kernel("gather") is None
     gather = jax.jit(lambda image: image_to_volume(shapes, rays, image))
     assert dispatch.TARGET not in gather.lower(image).as_text()
     np.testing.assert_allclose(gather(image), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_a_numba_that_cannot_compile_the_kernels_gives_one_warning(monkeypatch, loading):
+def test_a_numba_that_cannot_compile_the_kernels_gives_one_warning(monkeypatch, loading_anew):
     def fail(name):
         raise NumbaError(f"No implementation of function\nin {name}")
 
     monkeypatch.setattr(dispatch, "load", fail)
     with pytest.warns(RuntimeWarning, match="XLA is used instead") as warned:
-        assert [linear_map.cpu_kernel(name) for name in dispatch.KERNELS] == [None] * len(dispatch.KERNELS)
+        assert [loading.cpu_kernel(name) for name in dispatch.KERNELS] == [None] * len(dispatch.KERNELS)
     assert len(warned) == 1 and str(warned[0].message).endswith("NumbaError: No implementation of function")
 
 

@@ -12,7 +12,7 @@ from scipy.signal import convolve2d
 
 from gs_jax import FISTA, ConvolutionADMM, InputError, write_capture
 from gs_jax.__main__ import commands
-from gs_jax.projection.measured_psf import FieldConvolutionOperator
+from gs_jax.linear.measured_psf import FieldConvolutionOperator
 from gs_jax.reconstruction.deconvolution import deconvolve, run_deconvolution
 from gs_jax.reconstruction.field_fit import fit_field
 

@@ -13,6 +13,7 @@ ORDER = [
     "_version",
     "typing",
     "base",
+    "linear",
     "lenses",
     "layers",
     "materials",
@@ -101,7 +102,9 @@ def test_the_physics_knows_no_files_and_solvers_no_microscope():
     physics = imports_of("geometry", "lenses", "layers", "optics", "objectives", "projection")
     assert not {(module, other) for module, other in physics if other in ("io", "design", "simulation")}
     of_solvers = {
-        (module, other) for module, other in imports_of("solvers") if other not in ("base", "typing", "solvers")
+        (module, other)
+        for module, other in imports_of("solvers")
+        if other not in ("base", "typing", "linear", "solvers")
     }
     assert not of_solvers
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.projection.linear_map import LinearMap
+from gs_jax.linear.linear_map import LinearMap
 
 SCALE, MATRIX = 3, np.random.default_rng(0).normal(size=(4, 3))
 X, Y = np.array([1.0, -2.0, 0.5]), np.array([0.3, 1.0, -1.0, 2.0])

@@ -15,7 +15,7 @@ from skimage.restoration import denoise_tv_chambolle, richardson_lucy as of_skim
 
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
-from gs_jax.projection.measured_psf import ConvolutionOperator
+from gs_jax.linear.measured_psf import ConvolutionOperator
 from gs_jax.reconstruction.pipeline import PinholeRichardsonLucy
 from gs_jax.solvers.admm import ADMM, ConvolutionADMM
 from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, shrink, solve, total_variation

@@ -127,7 +127,7 @@ def reconstruct_command(
     from ..io.provenance import INTENSITY, SCORE, DepthFrame
     from ..io.recordings import open_recording
     from ..io.volumes import SURFACE_SUFFIXES, VOLUME_SUFFIXES, write_surface, write_volume
-    from ..projection.linear_map import compiled_for_cpu
+    from ..linear.linear_map import compiled_for_cpu
     from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)

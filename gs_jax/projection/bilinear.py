@@ -24,8 +24,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ..linear.linear_map import LinearMap
 from . import tiles
-from .linear_map import LinearMap
+from .cpu.loading import kernels
 from .rays import Axis, Pair, Rays, Shapes, interpolate, pairs
 
 # Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache. The magnification, which
@@ -115,7 +116,7 @@ def _rays_vjp_transpose(shapes: Shapes, constants, cotangents):
 _continuous_vjp = LinearMap(
     _rays_vjp,
     _rays_vjp_transpose,
-    kernels=("rays_vjp", None),
+    kernels=kernels("rays_vjp", None),
     accelerated=(partial(_rays_vjp, at_once=_LENSES), None),
 )
 
@@ -127,7 +128,13 @@ def rays_vjp(shapes: Shapes, rays: Rays, image, volume) -> Rays:
 
 
 # `(shapes, rays, image)` to dB/d(volume), `(shapes, rays, volume)` to dB/d(image); both differentiable.
-image_to_volume = LinearMap(_gather, _scatter, rays_vjp, ("gather", "scatter"), (tiles.gather, tiles.scatter))
+image_to_volume = LinearMap(
+    _gather,
+    _scatter,
+    rays_vjp,
+    kernels=kernels("gather", "scatter"),
+    accelerated=(tiles.gather, tiles.scatter),
+)
 volume_to_image = image_to_volume.T
 
 

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager
 from ..grid import Sensor
+from ..linear.linear_map import LinearMap
 from ..optics.diffraction import phasor
-from .linear_map import LinearMap
+from .cpu.loading import kernels
 
 
 def with_margin(imager: Imager, size: int) -> Imager:
@@ -94,7 +95,7 @@ def _kernels_vjp(sizes, kernels, sharp, image):
     return jax.vjp(lambda kernels: _convolve(sizes, kernels, sharp), kernels)[1](image)[0]
 
 
-_convolution = LinearMap(_convolve, _correlate, _kernels_vjp, ("convolve", "correlate"))
+_convolution = LinearMap(_convolve, _correlate, _kernels_vjp, kernels("convolve", "correlate"))
 
 
 def spectrum(kernel, down, across, *, symmetric=False):

@@ -2,43 +2,17 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import check_real, native
 from ..geometry import Imager
 from ..grid import Grid
+from ..linear.matrix_free import MatrixFree
 from .backprojection import backproject
 from .forward_model import Optics, check_optics, forward, psf_model
 
 
-def _volume_structure(self) -> jax.ShapeDtypeStruct:
-    """Shape and type of volumes."""
-    return jax.ShapeDtypeStruct(self.grid.volume_shape, self.imager.sensor_distance.dtype)
-
-
-def _image_structure(self) -> jax.ShapeDtypeStruct:
-    """Shape and type of images."""
-    return jax.ShapeDtypeStruct(self.imager.sensor.shape, self.imager.sensor_distance.dtype)
-
-
-def transpose(self) -> "Transposed":
-    """The exact adjoint, as `.T`."""
-    return Transposed(self)
-
-
-def as_matrix(self) -> Float[Array, "out in"]:
-    """The dense matrix, for small systems."""
-    return _as_function(self).as_matrix()
-
-
-def _as_function(operator):
-    return lx.FunctionLinearOperator(operator.mv, operator.in_structure())
-
-
-class ImagingOperator(lx.AbstractLinearOperator):
+class ImagingOperator(MatrixFree):
     """The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint.
 
     *Differentiable.*
@@ -71,8 +45,6 @@ class ImagingOperator(lx.AbstractLinearOperator):
     imager: Imager
     grid: Grid
     optics: Optics | str = None
-    in_structure, out_structure = _volume_structure, _image_structure
-    transpose, as_matrix = transpose, as_matrix
 
     def __post_init__(self):
         if isinstance(self.optics, str):
@@ -86,8 +58,14 @@ class ImagingOperator(lx.AbstractLinearOperator):
         assert not isinstance(self.optics, str)
         return forward(vector, self.imager, self.grid, self.optics)
 
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        return _volume_structure(self.imager, self.grid)
 
-class BackprojectionOperator(lx.AbstractLinearOperator):
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        return _image_structure(self.imager)
+
+
+class BackprojectionOperator(MatrixFree):
     """The paper's back-projection as a `lineax` operator, image to volume.
 
     *Differentiable.*
@@ -114,55 +92,22 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
     method: str = eqx.field(static=True, default="linear")
     normalize: bool = eqx.field(static=True, default=False)
     distortion: Float[Array | np.ndarray, " depth"] | None = None
-    in_structure, out_structure = _image_structure, _volume_structure
-    transpose, as_matrix = transpose, as_matrix
 
     def mv(self, vector: Num[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
         options = {"method": self.method, "normalize": self.normalize, "distortion": self.distortion}
         return backproject(vector, self.imager, self.grid, **options)
 
-
-class Transposed(lx.AbstractLinearOperator):
-    """The transpose of one of these operators."""
-
-    operator: lx.AbstractLinearOperator
-
-    def mv(self, vector: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-        check_real("vector", vector)
-        vector = jnp.asarray(native(vector), self.operator.out_structure().dtype)
-        return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)[0]
-
     def in_structure(self) -> jax.ShapeDtypeStruct:
-        return self.operator.out_structure()
+        return _image_structure(self.imager)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
-        return self.operator.in_structure()
-
-    def transpose(self) -> lx.AbstractLinearOperator:
-        return self.operator
-
-    def as_matrix(self) -> Float[Array, "out in"]:
-        return self.operator.as_matrix().T
+        return _volume_structure(self.imager, self.grid)
 
 
-def no_structure(operator: type[lx.AbstractLinearOperator]) -> None:
-    """Register a class with lineax, which dispatches on it, as real and without special structure."""
-    for of in (
-        lx.is_symmetric,
-        lx.is_diagonal,
-        lx.is_tridiagonal,
-        lx.is_lower_triangular,
-        lx.is_upper_triangular,
-        lx.is_positive_semidefinite,
-        lx.is_negative_semidefinite,
-        lx.has_unit_diagonal,
-    ):
-        of.register(operator)(lambda _: False)
-    for same in (lx.linearise, lx.conj):
-        same.register(operator)(lambda operator: operator)
-    lx.materialise.register(operator)(lambda operator: lx.materialise(_as_function(operator)))
+def _volume_structure(imager: Imager, grid: Grid) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
 
 
-for _class in (ImagingOperator, BackprojectionOperator, Transposed):
-    no_structure(_class)
+def _image_structure(imager: Imager) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(imager.sensor.shape, imager.sensor_distance.dtype)

@@ -16,10 +16,11 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import array_namespace
 from ..geometry import Imager
+from ..linear.linear_map import LinearMap
 from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
 from ..optics.polar_grid import Entries, SparseTable
-from .linear_map import LinearMap
+from .cpu.loading import kernels
 
 # Lenses whose stray light is computed at once, which bounds the memory.
 _LENSES = 112
@@ -148,7 +149,7 @@ def _spread_windows(windows, places, spots):
     return _read_windows.T(windows, start, spots)
 
 
-interpolate_windows = LinearMap(_window_values, _spread_windows, kernels=("read_windows", "add_windows"))
+interpolate_windows = LinearMap(_window_values, _spread_windows, kernels=kernels("read_windows", "add_windows"))
 
 
 def _gather_windows(windows, start, image):
@@ -240,4 +241,4 @@ def _times_columns(_, table: SparseTable, y):
     return _times_entries(table.columns, y)
 
 
-times_table = LinearMap(_times_rows, _times_columns, kernels=("times_rows", "times_columns"))
+times_table = LinearMap(_times_rows, _times_columns, kernels=kernels("times_rows", "times_columns"))

@@ -15,7 +15,7 @@ from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..projection.measured_psf import ConvolutionOperator, FieldConvolutionOperator, middle, scene_size
+from ..linear.measured_psf import ConvolutionOperator, FieldConvolutionOperator, middle, scene_size
 from ..solvers.admm import ADMM, ConvolutionADMM
 from ..solvers.base import estimate_of, run_solver
 from ..solvers.fista import FISTA

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from ..base.errors import input_error
-from ..projection.measured_psf import FieldConvolutionOperator, middle, scene_size
+from ..linear.measured_psf import FieldConvolutionOperator, middle, scene_size
 from ..solvers.richardson_lucy import hat_functions
 from .inverse_problem import subtract_offset
 

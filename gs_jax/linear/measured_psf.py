@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Complex, Float, Num
@@ -18,10 +17,10 @@ from jaxtyping import Array, Complex, Float, Num
 from ..base.arrays import as_float, as_shape, native
 from ..base.errors import InputError
 from .linear_map import LinearMap
-from .operators import as_matrix, no_structure, transpose
+from .matrix_free import MatrixFree
 
 
-class ConvolutionOperator(lx.AbstractLinearOperator):
+class ConvolutionOperator(MatrixFree):
     """Imaging through measured PSFs, one for each plane; its transpose `.T` is the exact adjoint.
 
     *Differentiable.*
@@ -99,11 +98,6 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
     def out_structure(self) -> ShapeDtypeStruct:
         return ShapeDtypeStruct(self.image_shape, self.spectra.real.dtype)
 
-    transpose, as_matrix = transpose, as_matrix
-
-
-no_structure(ConvolutionOperator)
-
 
 class _Sizes(NamedTuple):
     image: tuple[int, int]
@@ -148,7 +142,7 @@ def middle(image_shape: tuple[int, int], size: tuple[int, ...]) -> tuple[slice, 
     return rows, columns
 
 
-class FieldConvolutionOperator(lx.AbstractLinearOperator):
+class FieldConvolutionOperator(MatrixFree):
     """Imaging through PSFs that vary over the field: the image is the sum of `kernel * (weight scene)` over components.
 
     *Differentiable.*
@@ -213,8 +207,3 @@ class FieldConvolutionOperator(lx.AbstractLinearOperator):
 
     def out_structure(self) -> ShapeDtypeStruct:
         return self.components.out_structure()
-
-    transpose, as_matrix = transpose, as_matrix
-
-
-no_structure(FieldConvolutionOperator)

@@ -3,14 +3,10 @@
 CPUs run compiled kernels where there are any, GPUs and TPUs a form without loops over lenses.
 """
 
-import warnings
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.util import find_spec
-from threading import Lock
 from typing import Any, Literal
 
 import jax
@@ -45,7 +41,8 @@ class LinearMap:
         `constants_vjp(static, constants, x, y)`: the gradient of `<y, function(static, constants, x)>` with respect to
         the constants. Its leaves at integer constants are ignored. None: JAX derives it.
     kernels
-        Names in `cpu.dispatch` of the functions that replace `function` and `transpose` on a CPU in float32.
+        Replace `function` and `transpose` on a CPU in float32: functions without arguments, called when a program is
+        compiled, that return these, or None where there is no kernel.
     accelerated
         Functions that replace `function` and `transpose` on GPUs and TPUs, but not in second derivatives. None: the
         same as on CPUs.
@@ -54,7 +51,7 @@ class LinearMap:
     function: Callable
     transpose: Callable
     constants_vjp: Callable | None = None
-    kernels: tuple[str | None, str | None] = (None, None)
+    kernels: tuple[Callable | None, ...] = (None, None)
     accelerated: tuple[Callable | None, Callable | None] = (None, None)
 
     def __call__(self, static: Hashable, constants: PyTree, x: PyTree) -> PyTree:
@@ -191,15 +188,15 @@ def _run_on_cpu(*arrays, call):
     """Uses a compiled kernel in float32; float64 is for comparisons."""
     if _form.get() == "accelerated":
         return _run_on_accelerator(*arrays, call=call)
-    name = None if _form.get() == "xla" or jax.default_backend() != "cpu" else call.map.kernels[0]
-    if name is None:
+    load = None if _form.get() == "xla" or jax.default_backend() != "cpu" else call.map.kernels[0]
+    if load is None:
         return call(*arrays)
     _, x = call.split(arrays)
     single = {y.dtype for y in jax.eval_shape(call, *arrays)} == {jnp.dtype(jnp.float32)}
     # Of images; the rows of other arrays are long enough.
     columns = getattr(call.static, "image", (0, _LEAST_COLUMNS))[1]
     suitable = single and all(a.dtype != jnp.float64 for a in x) and columns >= _LEAST_COLUMNS
-    return call(*arrays, function=cpu_kernel(name) if suitable else None)
+    return call(*arrays, function=load() if suitable else None)
 
 
 mlir.register_lowering(_linear, mlir.lower_fun(_run_on_accelerator, multiple_results=True))
@@ -208,7 +205,6 @@ ad.primitive_jvps[_linear] = _jvp
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batch
 
-_lock = Lock()
 _form = ContextVar("form", default="kernels")
 
 
@@ -224,29 +220,3 @@ def compiled_for_cpu(form: Literal["xla", "accelerated"]) -> Iterator[None]:
         yield
     finally:
         _form.reset(token)
-
-
-def cpu_kernel(name: str) -> Callable | None:
-    """The function of this name in `cpu.dispatch`; None without numba, or, with a warning, if its kernel fails."""
-    with _lock:
-        return _load(name)
-
-
-@cache
-def _load(name):
-    if find_spec("numba") is None or find_spec(f"{__package__}.cpu") is None:
-        return None
-    try:
-        from .cpu import dispatch
-
-        return dispatch.load(name)
-    # Versions of numba, llvmlite or XLA that are too new, or no writable folder for numba's cache.
-    except Exception as error:
-        _warn(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
-        return None
-
-
-@cache
-def _warn(reason):
-    text = f"numba's kernels do not work, XLA is used instead, which is slower: {reason}"
-    warnings.warn(text, RuntimeWarning, stacklevel=2)

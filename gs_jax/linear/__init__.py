@@ -1,0 +1,1 @@
+"""Linear maps and operators of arrays: derivatives, transposes and convolutions, without a microscope."""
