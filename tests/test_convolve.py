@@ -9,7 +9,8 @@ import pytest
 from jax.test_util import check_grads
 from scipy.signal import fftconvolve
 
-from gs_jax.projection.convolution import sum_of_convolutions, upsample_by_two
+from gs_jax.linear.fourier import upsample_by_two
+from gs_jax.projection.convolution import sum_of_convolutions
 from gs_jax.projection.cpu.loading import cpu_kernel
 
 

@@ -16,11 +16,40 @@ from jaxtyping import Array, Complex, Float, Num
 
 from ..base.arrays import as_float, as_shape, native
 from ..base.errors import InputError
+from .fourier import centred_spectrum, fast_length
 from .linear_map import LinearMap
 from .matrix_free import MatrixFree
 
 
-class ConvolutionOperator(MatrixFree):
+class Convolution(MatrixFree):
+    """What the operators of measured PSFs share: spectra of kernels, and the window of the sensor in a larger scene.
+
+    `kept`: 1 for pixels that count, 0 for those that are left out, where images are zero; None keeps all.
+    """
+
+    spectra: Complex[Array, "kernel tall half"]
+    image_shape: tuple[int, int] = eqx.field(static=True)
+    scene_shape: tuple[int, int, int] = eqx.field(static=True)
+    kept: Float[Array, "row column"] | None
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the sensor within a plane of the scene."""
+        return middle(self.image_shape, self.scene_shape[1:])
+
+    def in_structure(self) -> ShapeDtypeStruct:
+        return ShapeDtypeStruct(self.scene_shape, self.spectra.real.dtype)
+
+    def out_structure(self) -> ShapeDtypeStruct:
+        return ShapeDtypeStruct(self.image_shape, self.spectra.real.dtype)
+
+    def _image(self, light: Float[Array, "kernel tall wide"]) -> Float[Array, "row column"]:
+        """The sum of the light convolved with its kernels, on the pixels that are kept."""
+        image = _convolution(_Sizes(self.image_shape, self.scene_shape[1:]), self.spectra, light)
+        return image if self.kept is None else self.kept * image
+
+
+class ConvolutionOperator(Convolution):
     """Imaging through measured PSFs, one for each plane; its transpose `.T` is the exact adjoint.
 
     *Differentiable.*
@@ -60,43 +89,22 @@ class ConvolutionOperator(MatrixFree):
     >>> solution = gs.solve(A, jnp.ones((20, 30)), gs.FISTA(steps=10))
     """
 
-    spectra: Complex[Array, "depth tall half"]
-    image_shape: tuple[int, int] = eqx.field(static=True)
-    scene_shape: tuple[int, int, int] = eqx.field(static=True)
-    kept: Float[Array, "row column"] | None
-
     def __init__(
         self,
         psf_stack: Num[Array | np.ndarray, "depth high wide"],
         image_shape: tuple[int, int] | None = None,
         kept: Float[Array | np.ndarray, "row column"] | None = None,
     ):
-        psf = jnp.asarray(native(psf_stack))
-        if psf.ndim != 3 or min(psf.shape) < 1:
-            raise InputError(f"psf_stack must be (depth, row, column) and not empty, got the shape {psf.shape}.")
-        psf = psf if jnp.issubdtype(psf.dtype, jnp.floating) else psf.astype(float)
-        self.image_shape = as_shape(image_shape or psf.shape[1:])
-        tall, wide = scene_size(self.image_shape, psf.shape[1:])
-        self.scene_shape = (len(psf), tall, wide)
-        self.spectra = lax.map(lambda plane: centred_spectrum(plane, (tall, wide)), psf)
+        if psf_stack.ndim != 3 or min(psf_stack.shape) < 1:
+            raise InputError(f"psf_stack must be (depth, row, column) and not empty, got the shape {psf_stack.shape}.")
+        self.image_shape = as_shape(image_shape or psf_stack.shape[1:])
+        self.spectra, size = _spectra(psf_stack, self.image_shape)
+        self.scene_shape = (len(psf_stack), *size)
         self.kept = None if kept is None else jnp.asarray(kept, self.spectra.real.dtype)
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the sensor within a plane of the scene."""
-        return middle(self.image_shape, self.scene_shape[1:])
 
     def mv(self, vector: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
         """The image of a scene."""
-        sizes = _Sizes(self.image_shape, self.scene_shape[1:])
-        image = _convolution(sizes, self.spectra, jnp.asarray(vector, self.spectra.real.dtype))
-        return image if self.kept is None else self.kept * image
-
-    def in_structure(self) -> ShapeDtypeStruct:
-        return ShapeDtypeStruct(self.scene_shape, self.spectra.real.dtype)
-
-    def out_structure(self) -> ShapeDtypeStruct:
-        return ShapeDtypeStruct(self.image_shape, self.spectra.real.dtype)
+        return self._image(jnp.asarray(vector, self.spectra.real.dtype))
 
 
 class _Sizes(NamedTuple):
@@ -121,18 +129,18 @@ def _correlate(sizes: _Sizes, spectra, image):
 _convolution = LinearMap(_convolve, _correlate)
 
 
+def _spectra(kernels: Num[Array | np.ndarray, "kernel high wide"], image_shape: tuple[int, int]):
+    """Spectra of kernels on the smallest scene that holds all points whose light reaches the sensor, and its size."""
+    kernels = jnp.asarray(native(kernels))
+    kernels = kernels if jnp.issubdtype(kernels.dtype, jnp.floating) else kernels.astype(float)
+    size = scene_size(image_shape, kernels.shape[1:])
+    return lax.map(lambda plane: centred_spectrum(plane, size), kernels), size
+
+
 def scene_size(image_shape: tuple[int, ...], psf_shape: tuple[int, ...]) -> tuple[int, int]:
     """Smallest size of fast FFTs that holds every point whose PSF reaches the sensor."""
-    from scipy.fft import next_fast_len  # imported here: solvers without FFTs do not need SciPy
-
-    rows, columns = (int(next_fast_len(n + k - 1, real=True) or 0) for n, k in zip(image_shape, psf_shape, strict=True))
+    rows, columns = (fast_length(n + k - 1) for n, k in zip(image_shape, psf_shape, strict=True))
     return rows, columns
-
-
-def centred_spectrum(psf: Float[Array, "high wide"], size: tuple[int, int]) -> Complex[Array, "tall half"]:
-    """Spectrum of a PSF on a scene's grid, its middle at the origin."""
-    padded = jnp.pad(psf, [(0, n - k) for n, k in zip(size, psf.shape, strict=True)])
-    return jnp.fft.rfft2(jnp.roll(padded, [-(k // 2) for k in psf.shape], (0, 1)))
 
 
 def middle(image_shape: tuple[int, int], size: tuple[int, ...]) -> tuple[slice, slice]:
@@ -142,7 +150,7 @@ def middle(image_shape: tuple[int, int], size: tuple[int, ...]) -> tuple[slice, 
     return rows, columns
 
 
-class FieldConvolutionOperator(MatrixFree):
+class FieldConvolutionOperator(Convolution):
     """Imaging through PSFs that vary over the field: the image is the sum of `kernel * (weight scene)` over components.
 
     *Differentiable.*
@@ -161,7 +169,6 @@ class FieldConvolutionOperator(MatrixFree):
         `(rows, columns)` of the sensor.
     """
 
-    components: ConvolutionOperator
     weights: Float[Array, "depth component down across"]
 
     def __init__(
@@ -170,40 +177,14 @@ class FieldConvolutionOperator(MatrixFree):
         weights: Float[Array | np.ndarray, "depth component down across"],
         image_shape: tuple[int, int],
     ):
-        self.components = ConvolutionOperator(kernels.reshape(-1, *kernels.shape[2:]), image_shape)
-        self.weights = as_float(weights).astype(self.components.spectra.real.dtype)
-        expected = (*kernels.shape[:2], *self.components.scene_shape[1:])
-        if self.weights.shape != expected:
+        self.image_shape, self.kept = as_shape(image_shape), None
+        self.spectra, size = _spectra(kernels.reshape(-1, *kernels.shape[2:]), self.image_shape)
+        self.scene_shape = (len(kernels), *size)
+        self.weights = as_float(weights).astype(self.spectra.real.dtype)
+        if self.weights.shape != (expected := (*kernels.shape[:2], *size)):
             raise ValueError(f"`weights` must be {expected}, got {self.weights.shape}.")
-
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """`(rows, columns)` of the sensor."""
-        return self.components.image_shape
-
-    @property
-    def kept(self) -> Float[Array, "row column"] | None:
-        """1 for pixels that count, 0 for those that are left out; None if all count."""
-        return self.components.kept
-
-    @property
-    def scene_shape(self) -> tuple[int, int, int]:
-        """`(depth, tall, wide)` of scenes."""
-        depths, _, tall, wide = self.weights.shape
-        return depths, tall, wide
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the sensor within a plane of the scene."""
-        return self.components.window
 
     def mv(self, vector: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
         """The image of a scene."""
         light = self.weights * jnp.asarray(vector, self.weights.dtype)[:, None]
-        return self.components.mv(light.reshape(self.components.scene_shape))
-
-    def in_structure(self) -> ShapeDtypeStruct:
-        return ShapeDtypeStruct(self.scene_shape, self.weights.dtype)
-
-    def out_structure(self) -> ShapeDtypeStruct:
-        return self.components.out_structure()
+        return self._image(light.reshape(-1, *self.scene_shape[1:]))

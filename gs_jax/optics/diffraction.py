@@ -14,10 +14,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from ..base.arrays import jit
 from ..geometry import Imager
+from ..linear.fourier import phasor
 from ..typing import ScalarLike
 from .pupil import pupil_quadrature, pupil_radius
 from .raytrace import Point, chief_ray_length, direction_cosines, trace_lenslet
@@ -127,11 +128,6 @@ def soft_aperture(points: Float[Array, "point 2"], radius: Array, edges, step: A
         for edge, at in zip(edges, length, strict=True):
             inward = jnp.minimum(inward, at - points @ (edge / at))
     return jnp.clip(inward / step + 0.5, 0, 1)
-
-
-def phasor(length: ArrayLike, phase: Array) -> Complex[Array, "..."]:
-    """`length exp(i phase)`, in the phase's precision."""
-    return jax.lax.complex(length * jnp.cos(phase), length * jnp.sin(phase))
 
 
 def fourier_transform(pupil: ExitPupil, x: Array, y: Array, turn: Array) -> Array:

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager
 from ..grid import Sensor
+from ..linear.fourier import fast_length, kernel_spectrum
 from ..linear.linear_map import LinearMap
-from ..optics.diffraction import phasor
 from .cpu.loading import kernels
 
 
@@ -71,13 +71,13 @@ def _convolve(sizes: Sizes, kernels, sharp):
         fit, first, need = (lambda image: jnp.pad(image, [(half, 0), (half, 0)])), 0, sizes.image
     else:
         fit, first, need = (lambda image: image[1:-1, 1:-1]), half, [n - 2 for n in sizes.sharp]
-    padded = rows, columns = [_fast_length(n) for n in need]
+    padded = rows, columns = [fast_length(n, even=True) for n in need]
     place = np.arange(-half, half + 1)
     down, across = np.arange(rows)[:, None] * place / rows, np.arange(columns // 2 + 1)[:, None] * place / columns
 
     def product(image, kernel):
         image_spectrum = jnp.fft.rfft2(fit(image), padded)
-        real, imaginary = spectrum(kernel, down, across, symmetric=sizes.symmetric)
+        real, imaginary = kernel_spectrum(kernel, down, across, symmetric=sizes.symmetric)
         if imaginary is None:
             return lax.complex(image_spectrum.real * real, image_spectrum.imag * real)
         return image_spectrum * lax.complex(real, imaginary)
@@ -96,54 +96,3 @@ def _kernels_vjp(sizes, kernels, sharp, image):
 
 
 _convolution = LinearMap(_convolve, _correlate, _kernels_vjp, kernels("convolve", "correlate"))
-
-
-def spectrum(kernel, down, across, *, symmetric=False):
-    """Real and imaginary part of a kernel's spectrum, or the real part and None for a symmetric kernel.
-
-    `down` and `across` are turns `(frequency, line)`. Two matrix products cost less than an FFT of the padded kernel.
-    """
-    matrix = lambda function, turns: jnp.asarray(function(2 * np.pi * (turns % 1)), kernel.dtype)
-    cosines, sines = matrix(np.cos, down) @ kernel, matrix(np.sin, down) @ kernel
-    by_cosine, by_sine = matrix(np.cos, across).T, matrix(np.sin, across).T
-    if symmetric:
-        return cosines @ by_cosine, None
-    return cosines @ by_cosine - sines @ by_sine, -(sines @ by_cosine + cosines @ by_sine)
-
-
-def _fast_length(lines: int) -> int:
-    from scipy.fft import next_fast_len  # here, because back-projection needs no FFT and no SciPy
-
-    return 2 * int(next_fast_len(-(-lines // 2), real=True) or 0)
-
-
-def upsample_by_two(
-    coarse: Float[Array, "short narrow"], first: int, shape: tuple[int, int]
-) -> Float[Array, "row column"]:
-    """An image on pixels half as large, by sinc interpolation, with the same sum.
-
-    Returns `shape` pixels, of which the first is in the large pixel number `first`, each way.
-    """
-    rows, columns = (_fast_length(n) for n in coarse.shape)
-    spectrum = jnp.fft.rfft2(coarse, (rows, columns))
-    low = rows // 2
-    # Without the highest frequencies of an even number of pixels, which have no sign.
-    kept = columns // 2
-    turn = lambda frequency, size: phasor(1, (-np.pi * 0.5 / size) * frequency.astype(coarse.dtype))
-    across, down = jnp.arange(kept), jnp.concatenate([jnp.arange(low), jnp.arange(low - rows, 0)])
-    moved = spectrum[:, :kept] * turn(down, rows)[:, None] * turn(across, columns)[None]
-    wide = [(0, 0), (0, columns + 1 - kept)]
-    spectrum = jnp.concatenate(
-        [jnp.pad(moved[:low], wide), jnp.zeros((rows + 1, columns + 1), moved.dtype), jnp.pad(moved[low + 1 :], wide)]
-    )
-    start = 2 * first
-    return jnp.fft.irfft2(spectrum, (2 * rows, 2 * columns))[start : start + shape[0], start : start + shape[1]]
-
-
-def scan_in_groups(add, image, planes, size: int):
-    """`add(image, group)` over consecutive groups of `size` planes; the last may be smaller."""
-    count = len(jax.tree.leaves(planes)[0])
-    whole = count // size * size
-    grouped = jax.tree.map(lambda a: a[:whole].reshape(-1, size, *a.shape[1:]), planes)
-    image = lax.scan(lambda image, group: (add(image, group), None), image, grouped)[0] if whole else image
-    return add(image, jax.tree.map(lambda a: a[whole:], planes)) if whole < count else image

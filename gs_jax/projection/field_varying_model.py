@@ -15,10 +15,11 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager, field_limit
 from ..grid import Grid, Sensor
+from ..linear.fourier import upsample_by_two
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.psf_core import ring_edges
 from .bilinear import Shapes, volume_to_image
-from .convolution import sum_of_convolutions, upsample_by_two, with_margin
+from .convolution import sum_of_convolutions, with_margin
 from .rays import RingLight, trace
 from .stray_light import cubic, stray_light_image, to_nodes
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num
 
@@ -21,7 +22,7 @@ from ..optics.lens_types import relative_areas, split_by_type, split_groups
 from ..optics.polar_grid import make_polar_grid
 from ..optics.psf import PSFS, psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
-from .convolution import scan_in_groups, sum_of_convolutions, with_margin
+from .convolution import sum_of_convolutions, with_margin
 from .field_varying_model import full_image
 
 FIDELITIES = ("full", "near", "pinhole")
@@ -268,4 +269,13 @@ def _forward(volume, imager: Imager, grid: Grid, optics: Optics) -> Float[Array,
         return image + sum_of_convolutions(sharp, kernels)
 
     planes = grid.depths, volume, jnp.asarray(optics, volume.dtype)
-    return scan_in_groups(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), planes, _DEPTHS)
+    return _scan_in_groups(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), planes)
+
+
+def _scan_in_groups(add, image, planes):
+    """Apply `add(image, group)` to consecutive groups of `_DEPTHS` planes; the last may be smaller."""
+    count = len(jax.tree.leaves(planes)[0])
+    whole = count // _DEPTHS * _DEPTHS
+    grouped = jax.tree.map(lambda a: a[:whole].reshape(-1, _DEPTHS, *a.shape[1:]), planes)
+    image = lax.scan(lambda image, group: (add(image, group), None), image, grouped)[0] if whole else image
+    return add(image, jax.tree.map(lambda a: a[whole:], planes)) if whole < count else image

@@ -19,7 +19,7 @@ from numba import cfunc, types
 from numba.core.caching import FunctionCache
 
 from ...geometry import FALLOFF, field_limit
-from ..convolution import spectrum
+from ...linear.fourier import kernel_spectrum
 from ..rays import Envelope, Rays
 from . import ffi, fftconv, kernels, windows
 from .simd import FAST, WIDTH
@@ -208,7 +208,7 @@ def _overlap_save(name, kernels, images, shapes, shift):
     while side < 3 * size:
         side *= 2
     turns = -_frequencies(side)[:, None] * np.arange(size) / side
-    real, imaginary = jax.vmap(lambda kernel: spectrum(kernel, turns, turns))(kernels)
+    real, imaginary = jax.vmap(lambda kernel: kernel_spectrum(kernel, turns, turns))(kernels)
     strips = lambda part: part.reshape(len(kernels), -1, WIDTH, side).swapaxes(2, 3)
     spectra = jnp.stack([strips(real), strips(imaginary)], 2).reshape(len(kernels), 2 * side, side) / side**2
     angles = 2 * np.pi * np.arange(side) / side
