@@ -5,7 +5,7 @@ harmonics. Sparse tables resample between square nodes (or pixels) and polar one
 """
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -19,7 +19,7 @@ from ..geometry import Imager
 from ..linear.linear_map import LinearMap
 from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
-from ..optics.polar_grid import Entries, SparseTable
+from ..optics.polar_grid import Entries
 from .cpu.loading import kernels
 
 # Lenses whose stray light is computed at once, which bounds the memory.
@@ -133,51 +133,33 @@ def _window_places(centers, origin, step, shape, side):
 def _window_values(windows, places, image):
     """Windows `(row, column, lens)` of an image, centred on the lenses; zero if they are not within it."""
     start, fraction = places
-    read = _read_windows(windows, start, image)
+    dimensions = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
+    image = image[: windows.shape[0] - _SPARE, : windows.shape[1] - _SPARE]
+    size = windows.side + 1
+    return _between_lines(fraction, lax.gather(image, start, dimensions, (size, size), mode="fill", fill_value=0))
+
+
+def _between_lines(fraction, read):
+    """Interpolate windows `(lens, row, column)`, which have one more line each way."""
     down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
     read = (1 - down) * read[:, :-1] + down * read[:, 1:]
     return jnp.moveaxis((1 - right) * read[..., :-1] + right * read[..., 1:], 0, -1)
 
 
-def _spread_windows(windows, places, spots):
-    """The adjoint of `_window_values`."""
-    start, fraction = places
-    down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
-    spots = jnp.moveaxis(spots, -1, 0)
-    spots = jnp.pad((1 - down) * spots, [(0, 0), (0, 1), (0, 0)]) + jnp.pad(down * spots, [(0, 0), (1, 0), (0, 0)])
-    spots = jnp.pad((1 - right) * spots, [(0, 0), (0, 0), (0, 1)]) + jnp.pad(right * spots, [(0, 0), (0, 0), (1, 0)])
-    return _read_windows.T(windows, start, spots)
+def _add_windows(windows, places, spots):
+    """The adjoint of `_window_values`, a scatter-add."""
+    image = jax.ShapeDtypeStruct(windows.shape, spots.dtype)
+    return jax.linear_transpose(partial(_window_values, windows, places), image)(spots)[0]
 
 
-interpolate_windows = LinearMap(_window_values, _spread_windows, kernels=kernels("read_windows", "add_windows"))
+def _sum_windows(windows, places, spots):
+    """`_add_windows` for GPUs and TPUs: each pixel looks into every window, in one sum over all.
 
-
-def _gather_windows(windows, start, image):
-    """Windows with one more line each way, `(lens, row, column)`; zero if they are not within the image."""
-    dimensions = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
-    image = image[: windows.shape[0] - _SPARE, : windows.shape[1] - _SPARE]
-    return lax.gather(image, start, dimensions, (windows.side + 1, windows.side + 1), mode="fill", fill_value=0)
-
-
-def _add_windows(windows, start, values):
-    """The transpose of `_gather_windows`, window by window: JAX before 0.11.1 compiles a scatter-add slowly for GPUs.
-
-    A gather, by which each pixel looks into every window, takes 2 to 15 times as long as a scatter-add on a CPU.
+    JAX before 0.11.1 compiles a scatter-add slowly for GPUs. On a CPU this takes 2 to 15 times as long as one.
     """
-    size = windows.side + 1
-    within = ((start >= 0) & (start <= jnp.asarray(windows.shape, start.dtype)[None] - size - _SPARE)).all(1)
-    values = jnp.where(within[:, None, None], values, 0)
-
-    def add(image, one):
-        at, value = one
-        return lax.dynamic_update_slice(image, lax.dynamic_slice(image, at, (size, size)) + value, at), None
-
-    return lax.scan(add, jnp.zeros(windows.shape, values.dtype), (start, values))[0]
-
-
-def _sum_windows(windows, start, values):
-    """`_add_windows` for GPUs and TPUs: each pixel looks into every window, in one sum over all."""
-    size = windows.side + 1
+    (start, fraction), size = places, windows.side + 1
+    read = jax.ShapeDtypeStruct((len(start), size, size), spots.dtype)
+    values = jax.linear_transpose(partial(_between_lines, fraction), read)(spots)[0]
 
     def lines(axis):
         """Each line of the image within each window, and whether it is in it, and that in the image."""
@@ -188,12 +170,17 @@ def _sum_windows(windows, start, values):
     (row, in_rows), (column, in_columns) = lines(0), lines(1)
     window = jnp.arange(len(start), dtype=start.dtype)[:, None] * size
     place = ((window + row) * size)[:, :, None] + column[:, None, :]
-    read = values.ravel().at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
-    image = jnp.where(in_rows[:, :, None] & in_columns[:, None, :], read, 0).sum(0)
+    found = values.ravel().at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    image = jnp.where(in_rows[:, :, None] & in_columns[:, None, :], found, 0).sum(0)
     return jnp.pad(image, [(0, _SPARE)] * 2)
 
 
-_read_windows = LinearMap(_gather_windows, _add_windows, accelerated=(None, _sum_windows))
+interpolate_windows = LinearMap(
+    _window_values,
+    _add_windows,
+    kernels=kernels("read_windows", "add_windows"),
+    accelerated=(None, _sum_windows),
+)
 
 
 def _upsampling_matrix(fine: int, coarse: int, ratio, dtype) -> Float[Array, "fine coarse"]:
@@ -224,7 +211,9 @@ def _times_entries(entries: Entries, x):
 
 
 def _times_part(index, weight, columns):
-    take = lambda at: columns.at[at].get(mode="promise_in_bounds")
+    def take(at):
+        return columns.at[at].get(mode="promise_in_bounds")
+
     if index.shape[1] > _FEW:
         return jnp.einsum("re,rec->rc", weight, take(index))
     total = jnp.zeros((len(index), columns.shape[1]), columns.dtype)
@@ -233,12 +222,8 @@ def _times_part(index, weight, columns):
     return total
 
 
-def _times_rows(_, table: SparseTable, x):
-    return _times_entries(table.rows, x)
-
-
-def _times_columns(_, table: SparseTable, y):
-    return _times_entries(table.columns, y)
-
-
-times_table = LinearMap(_times_rows, _times_columns, kernels=kernels("times_rows", "times_columns"))
+times_table = LinearMap(
+    lambda _, table, x: _times_entries(table.rows, x),
+    lambda _, table, y: _times_entries(table.columns, y),
+    kernels=kernels("times_rows", "times_columns"),
+)
