@@ -30,10 +30,16 @@ from gs_jax.detection.point_finder import find_points
 from gs_jax.geometry import falloff
 from gs_jax.optics import field_varying
 from gs_jax.optics.apertures import clear_area
-from gs_jax.optics.core_kernels import render_harmonics, render_kernel, sample_profile
 from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
 from gs_jax.optics.polar_grid import make_polar_grid, to_pixels_table
-from gs_jax.optics.psf_core import core_magnification, ring_edges, ring_window
+from gs_jax.optics.psf_core import (
+    core_magnification,
+    render_harmonics,
+    render_kernel,
+    ring_edges,
+    ring_window,
+    sample_profile,
+)
 from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
 from gs_jax.projection.field_varying_model import wider_voxels

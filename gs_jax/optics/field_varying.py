@@ -23,9 +23,22 @@ from ..base.progress import Progress
 from ..base.workers import map_in_threads
 from ..geometry import Imager
 from .apertures import clear_area
-from .core_kernels import harmonic_shares, narrow_kernel, render_harmonics, render_kernel, sample_profile, sharpen
 from .polar_grid import PolarGrid, SparseTable, make_polar_grid, polar_weights, to_pixels_table, to_polar_table
-from .psf_core import HARMONICS, RINGS, PsfCores, half_light_radii, ring_edges, ring_light, trace_cores
+from .psf_core import (
+    HARMONICS,
+    RINGS,
+    PsfCores,
+    half_light_radii,
+    harmonic_shares,
+    narrow_kernel,
+    render_harmonics,
+    render_kernel,
+    ring_edges,
+    ring_light,
+    sample_profile,
+    sharpen,
+    trace_cores,
+)
 from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pupil
 
 # Reach of a core's kernel, in pixels of stray light: what is wider is smooth enough for these.

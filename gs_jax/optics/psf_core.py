@@ -1,4 +1,4 @@
-"""The bright core of a lens's spot: where it lands, how bright it is, and its shape. Host code.
+"""The bright core of a lens's spot: where it lands, how bright it is, its shape and its kernels. Host code.
 
 With the lens's full aperture a spot is a core, a few pixels wide, in stray light that holds more than half of its
 energy. Spherical aberration and coma move the core off the chief ray by up to a percent of its distance from the lens's
@@ -16,7 +16,7 @@ from ..base.arrays import array_namespace
 from ..base.progress import Progress
 from ..base.workers import map_in_threads
 from ..geometry import Imager, falloff
-from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil
+from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil, vogel_spiral
 from .raytrace import to_numpy
 
 # Outer radii of the rings of the field, in field radii. Farther out cores are as wide as the pixels of stray light.
@@ -30,6 +30,8 @@ _FARTHEST, _STEPS, _SPARSE, _FINE = 0.08, 81, 8, 1e-4
 _BLUR = 3.0
 # Largest pixel by which sharpness is judged, in images of the widest field; depths traced before interpolating.
 _SHARP, _MOST = 0.006, 9
+# Samples of a rendered kernel.
+_SAMPLES = 2**17
 # Angular harmonics m of oriented cores: coma, astigmatism.
 HARMONICS = (1, 2)
 # Radial bins in a pixel, which are fine beside the nodes of stray light.
@@ -254,3 +256,73 @@ def _golden_section(cost: Callable[[float], float], low: float, high: float) -> 
 def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
     """Radius that holds half of the light of each ring's cores, in pixels, at the depth where it is least."""
     return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / BINS
+
+
+def sample_profile(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[np.ndarray, "point 2"]:
+    """Points `(x, y)` in pixels whose density follows a core's profile."""
+    order = np.arange(count) + 0.5
+    edges = np.arange(profile.size + 1) / BINS
+    return vogel_spiral(np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2)), order)
+
+
+def harmonic_shares(
+    points: Float64[np.ndarray, "point 2"],
+    profile: Float64[np.ndarray, " bin"],
+    harmonics: Float64[np.ndarray, "order bin"],
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The cosine and the sine of each harmonic at points of `sample_profile`, relative to the profile there."""
+    bins = np.minimum((np.hypot(*points.T) * BINS).astype(int), profile.size - 1)
+    ratios = np.divide(harmonics, profile, out=np.zeros_like(harmonics), where=profile > 0)
+    angle = np.arctan2(*points.T[::-1])
+    return [
+        (ratio[bins] * np.cos(m * angle), ratio[bins] * np.sin(m * angle))
+        for m, ratio in zip(HARMONICS[: len(ratios)], ratios, strict=True)
+    ]
+
+
+def render_kernel(
+    profile: Float64[np.ndarray, " bin"], size: int, parts: float | int = 1
+) -> Float64[np.ndarray, "row column"]:
+    """Symmetric kernel with a radial profile, on `size` x `size` (odd) pixels or `parts` of a pixel, with the sum 1."""
+    points = sample_profile(profile, _SAMPLES)
+    (light,) = _on_pixels(points, [np.full(_SAMPLES, 1 / _SAMPLES)], size, parts)
+    light = light + light[::-1] + light[:, ::-1] + light[::-1, ::-1]
+    return (light + light.T) / 8
+
+
+def render_harmonics(
+    profile: Float64[np.ndarray, " bin"],
+    harmonics: Float64[np.ndarray, "order bin"],
+    size: int,
+    parts: float | int = 1,
+) -> Float64[np.ndarray, "wave row column"]:
+    """Kernels of a core's harmonics on such pixels as `render_kernel`'s, for each order a cosine's and a sine's."""
+    points = sample_profile(profile, _SAMPLES // 8)
+    points = np.concatenate([points * sign for sign in np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])])
+    points = np.concatenate([points, points[:, ::-1]])
+    waves = [wave / len(points) for both in harmonic_shares(points, profile, harmonics) for wave in both]
+    return np.reshape(_on_pixels(points, waves, size, parts), (len(waves), size, size))
+
+
+def _on_pixels(points, waves, size, parts):
+    """Sums of each wave's values at points, on the pixels around the middle."""
+    column, row = np.floor(parts * points + size / 2).astype(int).T
+    inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
+    place = (row * size + column)[inside]
+    return [np.bincount(place, wave[inside], size * size).reshape(size, size) for wave in waves]
+
+
+def narrow_kernel(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
+    """Subtract a variance in squared pixels, each way, from a kernel; what would be negative is zero."""
+    kernel = np.maximum(sharpen(kernel, variance), 0)
+    return kernel / kernel.sum()
+
+
+def sharpen(
+    kernels: Float64[np.ndarray, "*wave row column"], variance: float
+) -> Float64[np.ndarray, "*wave row column"]:
+    """Subtract a variance in squared pixels, each way, from kernels that may be negative."""
+    for axis in (-2, -1):
+        around = np.roll(kernels, 1, axis) + np.roll(kernels, -1, axis)
+        kernels = kernels - variance / 2 * (around - 2 * kernels)
+    return kernels
