@@ -40,20 +40,51 @@ def aperture_area(array: MicrolensArray, *, directions: int = 512) -> Float[Arra
     """
     if not array.alike or array.others is not None:
         return jnp.sum(_edge_distances(array, directions) ** 2, 1) * (math.pi / directions)
-    count = min(_NEIGHBOURS, array.centers.shape[0] - 1)
-    radius = array.aperture_diameter / 2
-    sides = jnp.array([[1, 0], [-1, 0], [0, 1], [0, -1]], array.centers.dtype)
+    return _cut_disc_areas(array.centers, array.aperture_diameter / 2, array.half_plate)
 
-    def area(lens):
-        offset = array.centers - array.centers[lens][None]
+
+# Normals of the plate's sides.
+_SIDES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+
+
+@jax.custom_jvp
+def _cut_disc_areas(centers, radius, half_plate) -> Float[Array, " lens"]:
+    """Area of each lens's disc within the bisectors with its neighbours and the plate's sides."""
+    return _areas_and_slopes(centers, radius, half_plate)[0]
+
+
+@_cut_disc_areas.defjvp
+def _(primals, tangents):
+    """By the edges found in the forward pass: compiled derivatives do not go back through the search for them."""
+    move, growth, stretch = tangents
+    areas, near, by_offset, by_room, by_radius = _areas_and_slopes(*primals)
+    sides = jnp.asarray(_SIDES, move.dtype)
+    by_neighbours = jnp.sum(by_offset * (move[near] - move[:, None]), (1, 2))
+    by_plate = jnp.sum(by_room * (jnp.repeat(stretch, 2)[None] - move @ sides.T), 1)
+    return areas, by_neighbours + by_plate + by_radius * growth
+
+
+def _areas_and_slopes(centers, radius, half_plate):
+    """Areas; the neighbours of each lens; and derivatives by their offsets, by the room on the plate, by the radius."""
+    count = min(_NEIGHBOURS, centers.shape[0] - 1)
+    sides = jnp.asarray(_SIDES, centers.dtype)
+
+    def of_lens(lens):
+        offset = centers - centers[lens][None]
         _, near = lax.top_k(-jnp.sum(offset**2, axis=1), count + 1)
-        normal, height = _bisectors(offset[near], array.aperture_diameter)
+        normal, height = _bisectors(offset[near], 2 * radius)
         # Beyond the disc a line closes the polygon without effect, where the plate is infinite.
-        half = jnp.repeat(array.half_plate, 2)
-        room = jnp.minimum(half - sides @ array.centers[lens], array.aperture_diameter)
-        return _disc_polygon_area(jnp.concatenate([normal, sides]), jnp.concatenate([height, room]), radius)
+        room = jnp.minimum(jnp.repeat(half_plate, 2) - sides @ centers[lens], 2 * radius)
+        lines = jnp.concatenate([normal, sides]), jnp.concatenate([height, room])
+        area, low, high = _disc_polygon_area(*lines, radius)
+        # A line that moves outward adds its edge's length, one that turns the edge's moment, the rim its arc.
+        arc = (2 * area - lines[1] @ (high - low)) / radius
+        length, moment = (high - low)[: len(near)], (high**2 - low**2)[: len(near)]
+        along = jnp.stack([-normal[:, 1], normal[:, 0]], -1)
+        by_offset = length[:, None] / 2 * normal - (moment / (4 * height))[:, None] * along
+        return area, near, by_offset, (high - low)[len(near) :], arc
 
-    return _map_lenses(area, array.centers)
+    return _in_batches(of_lens, jnp.arange(len(centers)))
 
 
 def _edge_distances(array: MicrolensArray, count: int) -> Float[Array, "lens direction"]:
@@ -266,7 +297,10 @@ def _bisectors(offset, diameter):
 
 
 def _disc_polygon_area(normal, height, radius):
-    """Area of a disc within the polygon of lines at these distances from its centre: a sum over its edges."""
+    """Area of a disc within the polygon of lines at these distances from its centre: a sum over its edges.
+
+    And where the edge on each line begins and ends within the disc, from the foot on; both 0 without an edge.
+    """
     cos = normal @ normal.T
     sin = normal[:, :1] * normal[:, 1:].T - normal[:, 1:] * normal[:, :1].T
     crossing = jnp.abs(sin) > 8 * jnp.finfo(height.dtype).eps
@@ -278,8 +312,10 @@ def _disc_polygon_area(normal, height, radius):
     tie = (height[None] == height[:, None]) & (order[None] < order[:, None])
     hidden = jnp.any(~crossing & (cos > 0) & ((height[None] < height[:, None]) | tie), axis=1)
     edge = ~hidden & (low < high)
-    wedges = wedge_area(jnp.where(edge, high, 0), height, radius) - wedge_area(jnp.where(edge, low, 0), height, radius)
-    return jnp.sum(wedges)
+    low, high = jnp.where(edge, low, 0), jnp.where(edge, high, 0)
+    area = jnp.sum(wedge_area(high, height, radius) - wedge_area(low, height, radius))
+    half_chord = safe_sqrt(radius**2 - height**2)
+    return area, *(jnp.clip(end, -half_chord, half_chord) for end in (low, high))
 
 
 def wedge_area(end, height, radius):
