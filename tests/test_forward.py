@@ -1,17 +1,11 @@
-import subprocess
-import sys
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 from scipy.signal import fftconvolve
-from scipy.special import erf
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
 from gs_jax.apps.benchmark import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.optics.psf import gaussian_psf
@@ -52,25 +46,6 @@ def test_without_a_psf_it_is_the_adjoint_of_back_projection():
         np.testing.assert_array_equal(forward(integers, imager, grid, psf), floats)
 
 
-def volume_and_image():
-    imager, grid = scene(jnp.float32)
-    volume = backproject(jax.random.uniform(jax.random.key(0), imager.sensor.shape, jnp.float32), imager, grid)
-    return volume, forward(volume, imager, grid, psfs(3, dtype=jnp.float32))
-
-
-@pytest.mark.integration
-def test_without_cpu_kernels_xla_computes_the_same(tmp_path):
-    """Where their folder is not there; without a warning, as without numba."""
-    code = "import sys; sys.modules['gs_jax.projection.cpu'] = None; from tests import test_forward as t; "
-    code += "t.np.savez(sys.argv[1], *t.volume_and_image())"
-    call = [sys.executable, "-c", code, str(tmp_path / "results.npz")]
-    done = subprocess.run(call, cwd=Path(__file__).parents[1], capture_output=True, text=True)
-    assert done.returncode == 0 and not done.stderr, done.stderr
-    with np.load(tmp_path / "results.npz") as results:
-        for ours, plain in zip(volume_and_image(), results.values(), strict=True):
-            np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=2e-6 * float(ours.max()))
-
-
 @pytest.mark.integration
 def test_each_depth_is_convolved_with_its_psf():
     imager, grid = scene()
@@ -98,36 +73,6 @@ def test_light_of_chief_rays_beside_the_sensor():
     point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, make_stamps(np.array([20.0]), fine))
     kernel = jnp.asarray(fine.reshape(1, 11, 5, 11, 5).sum((2, 4)))
     np.testing.assert_allclose(forward(jnp.ones((1, 1, 1)), beside, lone, kernel), point, atol=1e-6)
-
-
-@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 1e-5)])
-def test_its_transpose_is_its_adjoint(dtype, tolerance):
-    imager, grid = scene(dtype)
-    volume, kernels = volume_of(grid, dtype), psfs(3, dtype=dtype)
-    image = np.random.default_rng(3).normal(size=imager.sensor.shape).astype(dtype)
-
-    @jax.jit
-    def both(volume, image, imager, grid, kernels):
-        (back,) = jax.linear_transpose(lambda volume: forward(volume, imager, grid, kernels), volume)(image)
-        return jnp.vdot(volume, back), jnp.vdot(forward(volume, imager, grid, kernels), image)
-
-    back, forth = both(volume, image, imager, grid, kernels)
-    np.testing.assert_allclose(back, forth, rtol=tolerance)
-
-
-@pytest.mark.integration
-def test_gradients():
-    imager, grid = scene()
-    volume, kernels = volume_of(grid), psfs(3)
-    weights = jax.random.normal(jax.random.key(3), imager.sensor.shape)
-
-    def weighted(centers, distance, shift, volume, kernels):
-        moved = Imager(MicrolensArray(centers), imager.sensor, distance, imager.field_radius, shift=shift)
-        return jnp.vdot(weights, forward(volume, moved, grid, kernels))
-
-    arguments = imager.array.centers, imager.sensor_distance, imager.shift, volume, kernels
-    # Steps far below a pixel: linear interpolation has kinks at whole pixels.
-    check_grads(weighted, arguments, order=1, eps=1e-6, atol=1e-4, rtol=1e-4)
 
 
 def test_the_surface_of_a_lens_has_gradients_by_its_psf():
@@ -239,32 +184,6 @@ def test_equation_2_as_printed_departs_by_the_envelope_across_a_zone():
 
 
 # The image of points.
-
-
-def line(pixels, middle, width, pitch=0.02):
-    """A Gaussian of standard deviation `width` about the pixel coordinate `middle`, integrated over pixels."""
-    edges = (np.arange(pixels + 1) - 0.5 - middle) * pitch
-    return np.diff(erf(edges / (width * 2**0.5))) / 2
-
-
-def test_points_are_gaussians_where_the_chief_rays_land():
-    imager = Imager(MicrolensArray([[0.1, 0.0], [-0.33, 0.21], [1.9, 0.3]]), Sensor((120, 100), 0.02), 5.8, 0.6)
-    points = np.array([[0.03, 0.01, 20.0, 2.0], [-0.11, 0.12, 21.0, 1.0], [1.45, 0.3, 20.5, 1.0]])
-    width, size = np.array([0.03, 0.05]), 25 * STEPS
-    fine = np.stack([np.outer(*2 * [line(size, (size - 1) / 2, w, 0.02 / STEPS)]) for w in width])
-    image = forward_points(points, imager, make_stamps(np.array([20.0, 22.0]), fine))
-    expected = np.zeros((120, 100))
-    imager = to_numpy(imager)
-    pixels = imager.sensor.to_pixels(imager.project(points[:, :3]))
-    for (x, y, z, intensity), places in zip(points, pixels.swapaxes(0, 1), strict=True):
-        far = (z - 20) / 2
-        for (cx, cy), (row, column) in zip(imager.centers, places, strict=True):
-            light = float(envelope((cx - x) ** 2 + (cy - y) ** 2, imager.reduced_depth(z), imager.field_radius))
-            for w, part in zip(width, (1 - far, far), strict=True):
-                expected += intensity * light * part * np.outer(line(120, row, w), line(100, column, w))
-    # Up to a tenth of a pixel along each axis, on a slope of at most 0.6 / width.
-    np.testing.assert_allclose(image, expected, atol=2 * 0.1 * 0.02 * 0.6 / width.min() * expected.max())
-    np.testing.assert_allclose(image.sum(), expected.sum(), rtol=1e-3)  # what is beyond the stamp's window
 
 
 def spots_one_by_one(points, imager, depths, fine):

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from experiments.design_judge import diffracted
 from experiments.ray_tracer import traced
@@ -65,44 +64,6 @@ def grid(dtype=float, shape=(13, 12)) -> Grid:
 
 def volume(shape, dtype=float) -> np.ndarray:
     return np.random.default_rng(0).random(shape).astype(dtype)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-11), (jnp.float32, 1e-5)])
-@pytest.mark.parametrize(("pixels", "pitch", "inner"), [((96, 81), 0.06, 5), ((80, 80), 0.0045, 1)])
-def test_the_adjoint_is_exact(dtype, rtol, pixels, pitch, inner):
-    scope, voxels = imager(dtype, pixels=pixels, pitch=pitch), grid(dtype)
-    optics = field_varying_psf(scope, voxels.depths)
-    assert optics.kernels.shape[1] == inner and optics.wide_kernels.shape[1] == 6 - inner
-    A = ImagingOperator(scope, voxels, optics)
-    x = volume(voxels.volume_shape, dtype)
-    y = jax.random.uniform(jax.random.key(1), pixels, dtype)
-    one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
-    np.testing.assert_allclose(one, other, rtol=rtol)
-    assert A.mv(x).dtype == dtype and one > 0
-
-
-@pytest.fixture(scope="module")
-def brightness():
-    """A weighted sum of an image's pixels, by the volume and the microscope, and where it is taken."""
-    scope, voxels = imager(), grid(shape=(6, 5))
-    optics = field_varying_psf(scope, voxels.depths)
-    weights = jax.random.normal(jax.random.key(2), scope.sensor.shape)
-    return jax.jit(lambda x, scope: jnp.vdot(weights, forward(x, scope, voxels, optics))), voxels.volume_shape, scope
-
-
-@pytest.mark.integration
-def test_gradients_by_volume_and_microscope(brightness):
-    of, shape, scope = brightness
-    # Interpolations have kinks: steps that are small beside a pixel.
-    check_grads(of, (volume(shape), scope), 1, modes=["rev"], eps=1e-7, rtol=1e-3)
-
-
-@pytest.mark.integration
-def test_darkness_is_dark_and_has_finite_gradients(brightness):
-    of, shape, scope = brightness
-    value, back = jax.vjp(of, jnp.zeros(shape), scope)
-    assert value == 0 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(back(jnp.ones(()))))
 
 
 def traced_light(scope: Imager, point) -> float:
@@ -186,10 +147,12 @@ def test_fewer_rings_hold_the_same_light():
     assert alike(six, points) > max(alike(two, points), 0.95) and alike(binned(two), binned(six)) > 0.99
 
 
-@pytest.mark.parametrize("rings", [(), (1.0,), (1.0, 1.0), (2.0, 1.0), (0.0, 1.0)])
-def test_rings_that_are_none_are_refused(rings):
-    with pytest.raises(InputError, match="rings must be two or more radii that ascend, got"):
-        field_varying_psf(imager(), DEPTHS, rings=rings)
+def test_unknown_fidelities_and_rings_that_are_none_are_refused():
+    with pytest.raises(InputError, match="fidelity must be one of full, near, pinhole, got 'exact'"):
+        psf_model(imager(), grid(), "exact")
+    for rings in ((), (1.0,), (1.0, 1.0), (2.0, 1.0), (0.0, 1.0)):
+        with pytest.raises(InputError, match="rings must be two or more radii that ascend, got"):
+            field_varying_psf(imager(), DEPTHS, rings=rings)
 
 
 def test_points_are_voxels_that_lie_anywhere():
@@ -345,25 +308,6 @@ def test_sharp_spots_have_coma(name, tilt, at, sensor, symmetric):
     assert error(full_image_of_points(points, scope)) < 0.65 * symmetric
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize("tilt", [None, (0.01, -0.006)])
-def test_oriented_cores_have_an_exact_adjoint_and_gradients(tilt):
-    """Of two lenses with the curved side in front, on a region of the sensor."""
-    lens = alone("geomscope-asphere", Sensor((40, 60), 0.02, (-0.3, -0.2)))
-    array = dataclasses.replace(lens.array, centers=jnp.array([[0.0, 0.0], [0.9, 0.4]]))
-    scope, voxels = dataclasses.replace(lens, array=array, tilt=tilt), Grid([19.0, 21.0], (4, 5), 0.5, (2.6, 1.4))
-    optics = field_varying_psf(scope, voxels.depths)
-    assert optics.harmonics.size + optics.wide_harmonics.size > 0
-    A, x = ImagingOperator(scope, voxels, optics), volume(voxels.volume_shape)
-    y = jax.random.normal(jax.random.key(1), scope.sensor.shape)
-    np.testing.assert_allclose(jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x), rtol=1e-10)
-    of = lambda x, distance: jnp.vdot(
-        y, forward(x, eqx.tree_at(lambda i: i.sensor_distance, scope, distance), voxels, optics)
-    )
-    # As above: interpolations have kinks.
-    check_grads(of, (x, scope.sensor_distance), 1, modes=["rev"], eps=1e-7, rtol=1e-3)
-
-
 def test_a_lens_without_aberrations_has_its_cores_on_the_chief_rays():
     scope = imager(pitch=0.01)
     thin = eqx.tree_at(lambda i: i.array.thin_lens_focal_length, scope, jnp.asarray(4.6), is_leaf=lambda x: x is None)
@@ -432,11 +376,6 @@ def test_a_model_of_other_planes_pixels_or_objects_is_refused():
     ):
         with pytest.raises(InputError, match="sensor's pixels of 500 um, got"):
             user()
-
-
-def test_an_unknown_fidelity_is_refused():
-    with pytest.raises(InputError, match="fidelity must be one of full, near, pinhole, got 'exact'"):
-        psf_model(imager(), grid(), "exact")
 
 
 @pytest.mark.integration

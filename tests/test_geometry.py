@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from scipy import integrate
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
-from gs_jax.geometry import chief_ray, envelope
+from gs_jax.geometry import envelope
 from gs_jax.optics.raytrace import trace_lenslet
 
 from .helpers import scene
@@ -102,11 +102,6 @@ def test_a_grid_knows_where_its_voxels_are():
     assert one.volume_shape == (1, 3, 5) and one.depths[0] == 21
     np.testing.assert_array_equal(one.origin, grid.origin)
     np.testing.assert_allclose(Sensor((3, 5), 0.1).extent, (-0.25, 0.25, 0.15, -0.15))
-
-
-def test_map_is_separable():
-    center, q = np.array([1.0, 2.0]), np.array([0.3, -0.4])
-    np.testing.assert_array_equal(chief_ray(center, q, 0.28)[0], chief_ray(center[0], q[0], 0.28))
 
 
 @pytest.mark.parametrize(

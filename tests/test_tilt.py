@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
@@ -130,17 +129,6 @@ def test_no_tilt_and_a_tilt_of_zero_are_the_same():
 
 def tilted_by(tilt) -> Imager:
     return eqx.tree_at(lambda i: i.tilt, tilted(), tilt)
-
-
-@pytest.mark.integration
-def test_operators_are_adjoint_and_differentiable_by_the_tilt():
-    rng, grid = np.random.default_rng(2), Grid([18.0, 20.0, 22.0], (101, 111), 0.07)
-    volume = rng.random(grid.volume_shape)
-    image = gaussian_filter(rng.random((700, 720)), 8)
-    there, back = forward(volume, tilted(), grid), backproject(image, tilted(), grid)
-    assert np.vdot(image, there) == pytest.approx(np.vdot(volume, back), rel=1e-11)
-    value = lambda tilt: jnp.vdot(backproject(image, tilted_by(tilt), grid), volume)
-    check_grads(value, (jnp.asarray(TILT),), 1, modes=["rev"], eps=1e-6, rtol=1e-3)
 
 
 @pytest.mark.parametrize("dtype, orientation", [(jnp.float64, "plano"), (jnp.float32, "curved")])

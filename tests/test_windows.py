@@ -12,31 +12,8 @@ from .test_imports import MODULES, names
 # Modules of POSIX alone, and what `os` and `signal` have there alone.
 ABSENT = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "syslog"}
 CALLS = {
-    "os": {
-        "fork",
-        "uname",
-        "getuid",
-        "geteuid",
-        "getpgid",
-        "setsid",
-        "killpg",
-        "statvfs",
-        "mkfifo",
-        "chown",
-        "sysconf",
-    },
-    "signal": {
-        "SIGKILL",
-        "SIGHUP",
-        "SIGUSR1",
-        "SIGUSR2",
-        "SIGALRM",
-        "SIGCHLD",
-        "SIGPIPE",
-        "alarm",
-        "setitimer",
-        "pause",
-    },
+    "os": set("fork uname getuid geteuid getpgid setsid killpg statvfs mkfifo chown sysconf".split()),
+    "signal": set("SIGKILL SIGHUP SIGUSR1 SIGUSR2 SIGALRM SIGCHLD SIGPIPE alarm setitimer pause".split()),
 }
 # What reads and writes text in the machine's own encoding unless told, and the place of `encoding`.
 TEXT = {"read_text": 0, "write_text": 1, "open": None}

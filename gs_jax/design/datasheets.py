@@ -241,7 +241,7 @@ def overview(design: Design, sheet: dict[str, Any], *, circle_of_confusion: floa
     depths, limit = sheet["depth_mm"], 1000 * circle_of_confusion_of(design, circle_of_confusion)
     blurred = sum(blur > limit for blur in sheet["blur_um"])
     lines = [
-        _format_path(sheet),
+        format_light_path(sheet),
         format_band(sheet),
         f"a point at {ends('depth_mm')} mm, seen in the object: FWHM {ends('fwhm_um')} um on the axis, half of the "
         f"light within {ends('half_light_radius_um')} um, RMS width {ends('rms_width_um')} um; Eq. 5 promises "
@@ -252,7 +252,7 @@ def overview(design: Design, sheet: dict[str, Any], *, circle_of_confusion: floa
     return [line for line in lines if line]
 
 
-def _format_path(sheet: dict[str, Any]) -> str:
+def format_light_path(sheet: dict[str, Any]) -> str:
     """Layers and sample of a datasheet in one line; empty without any."""
     parts = []
     for side, where in (("object", "before the array"), ("sensor", "before the sensor")):

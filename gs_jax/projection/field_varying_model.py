@@ -132,7 +132,7 @@ def _by_powers_of_field(image, plane: _Plane, ring: _Rings):
     scale = ring.outer.astype(depths.dtype) * (
         1 + ring.distortion.astype(depths.dtype) * imager.magnification(depths)[0]
     )
-    pixels = Grid(depths, sensor.shape, sensor.pixel_pitch, sensor.origin)
+    pixels = Grid(depths, sensor.shape, sensor.pixel_pitch, jnp.asarray(sensor.origin, depths.dtype))
     # The lens's axis and its image, of the lens in the middle.
     offset = imager.axis_offset(depths)[0] - imager.image_of_axis
     voxel = grid.x[None] / scale, grid.y[:, None] / scale
