@@ -35,7 +35,6 @@ class Sensor(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
     >>> sensor = gs.Sensor((3000, 4096), pixel_pitch=0.00345)
     >>> print(sensor.to_pixels(np.array([0.0, 0.0])))  # the middle, (row, column)
     [1499.5 2047.5]
@@ -101,8 +100,7 @@ class Grid(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> grid = gs.Grid.over(gs.Sensor((200, 200), 0.02), depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
     >>> grid.volume_shape
     (3, 41, 41)
     >>> grid.at([19.0, 21.0]).volume_shape

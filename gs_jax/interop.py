@@ -25,10 +25,7 @@ def as_scipy(A: lx.AbstractLinearOperator) -> Any:
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> from gs_jax.interop import as_scipy
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
     >>> A = as_scipy(gs.ImagingOperator(scope, gs.Grid.over(scope.sensor, depths=[20.0], pitch=0.1)))
     >>> A.shape
     (40000, 1681)

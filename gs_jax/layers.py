@@ -34,7 +34,6 @@ class Layers(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> glass = gs.Layers([2.0, 0.5], [1.52, 1.0])
     >>> print(round(float(glass.shortening), 3))  # 2 mm - 2 mm / 1.52
     0.684
@@ -91,13 +90,9 @@ class Sample(eqx.Module):
     Examples
     --------
     >>> import dataclasses
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9]], substrate_thickness=0.0)
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> gel = gs.Sample(1.43, surface=19.0)
-    >>> wet = dataclasses.replace(scope, sample=gel)
-    >>> print(round(float(wet.reduced_depth(21.0)), 3))  # 19 mm of air, 2 mm of gel
-    20.399
+    >>> wet = dataclasses.replace(scope, sample=gs.Sample(1.43, surface=19.0))
+    >>> print(round(float(wet.reduced_depth(21.0)), 3))  # 19 mm of air, 2 mm of gel, 1 mm of the plate
+    21.098
     """
 
     refractive_index: Float[Array, ""] = eqx.field(converter=as_float)

@@ -94,7 +94,6 @@ class MicrolensArray(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> array = gs.MicrolensArray([[0.0, 0.0], [1.2, 0.0]], radius_of_curvature=2.0, refractive_index=1.43)
     >>> print(round(float(array.focal_length), 2))  # R / (n - 1), mm
     4.65

@@ -83,7 +83,6 @@ def refractive_index(material: str, wavelength_nm: float) -> float:
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> round(gs.refractive_index("BK7", 587.6), 4), round(gs.refractive_index("PDMS", 520.0), 4)
     (1.5168, 1.4144)
     """
@@ -127,7 +126,6 @@ class EmissionBand(eqx.Module):
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> band = gs.EmissionBand([0.25, 0.5, 0.25], [505e-6, 520e-6, 535e-6], lens=[0.0008, 0.0, -0.0008])
     >>> len(band)
     3

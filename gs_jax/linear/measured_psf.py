@@ -81,7 +81,7 @@ class ConvolutionOperator(Convolution):
 
     Examples
     --------
-    >>> import gs_jax as gs, jax.numpy as jnp
+    >>> import jax.numpy as jnp
     >>> stack = jnp.zeros((2, 20, 30)).at[0, 10, 15].set(1.0).at[1, 10, [5, 25]].set(0.5)
     >>> A = gs.ConvolutionOperator(stack)
     >>> A.in_structure().shape, A.out_structure().shape

@@ -108,10 +108,6 @@ def psf_model(
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
     >>> model = gs.psf_model(scope, grid, "near")
     >>> model.parts[0].shape[0], model.depths.tolist()
     (3, [18.0, 20.0, 22.0])
@@ -218,11 +214,6 @@ def forward(
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 20, 20] = 1.0
     >>> image = gs.forward(scene, scope, grid)  # by pinholes

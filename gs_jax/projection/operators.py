@@ -33,10 +33,6 @@ class ImagingOperator(MatrixFree):
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
     >>> A = gs.ImagingOperator(scope, grid)
     >>> A.in_structure().shape, A.out_structure().shape
     ((3, 41, 41), (200, 200))
@@ -79,9 +75,6 @@ class BackprojectionOperator(MatrixFree):
 
     Examples
     --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
     >>> B = gs.BackprojectionOperator(scope, gs.Grid.over(scope.sensor, depths=[20.0], pitch=0.1), normalize=True)
     >>> B.in_structure().shape, B.out_structure().shape
     ((200, 200), (1, 41, 41))
