@@ -116,7 +116,8 @@ OPERATORS = {
     "tilted": lambda: ImagingOperator(dataclasses.replace(scene()[0], tilt=(0.015, -0.02)), scene()[1]),
     "kernels": of_kernels,
     "near": lambda: ImagingOperator(*scene(), "near"),
-    "full": lambda: of_full_model(5),
+    "full": lambda: ImagingOperator(*scene(), "full"),
+    "full, large pixels": lambda: of_full_model(5),
     "full, small pixels": lambda: of_full_model(1, pixels=(80, 80), pitch=0.0045),
     "full, sharp": of_sharp_lenses,
     "full, sharp, tilted": lambda: of_sharp_lenses((0.01, -0.006)),
@@ -153,10 +154,10 @@ def test_the_transpose_is_the_adjoint_and_maps_over_batches(name, dtype):
 
 
 @CASES
-def test_derivatives_by_the_input_and_the_microscope(name):
-    """Against differences: the gradient, and its own derivative by centres and distance; finite in the dark."""
+def test_gradients_by_the_input_and_the_microscope(name):
+    """Against differences; in the dark they are finite."""
     A, rng = operator(name), np.random.default_rng(0)
-    truth, weights = (gaussian_filter(rng.normal(size=A.out_structure().shape), 2) for _ in range(2))
+    weights = gaussian_filter(rng.normal(size=A.out_structure().shape), 2)
     x = gaussian_filter(rng.normal(size=A.in_structure().shape), 1)
 
     @jax.jit
@@ -167,6 +168,16 @@ def test_derivatives_by_the_input_and_the_microscope(name):
     check_grads(value, (x, A.imager), 1, modes=["rev"], eps=1e-7, rtol=1e-3)
     dark, back = jax.vjp(value, jnp.zeros(x.shape), A.imager)
     assert dark == 0 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(back(jnp.ones(()))))
+
+
+TWICE = [name for name in OPERATORS if name in ("pinholes", "near", "full", "back-projection", "normalized")]
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FAST else pytest.mark.integration) for n in TWICE])
+def test_hessian_vector_products_are_differences_of_gradients(name):
+    A, rng = operator(name), np.random.default_rng(0)
+    truth, weights = (gaussian_filter(rng.normal(size=A.out_structure().shape), 2) for _ in range(2))
+    x = gaussian_filter(rng.normal(size=A.in_structure().shape), 1)
 
     def loss(centers, v):
         at = lambda A: (A.imager.array.centers, A.imager.sensor_distance)

@@ -95,11 +95,12 @@ def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 class _Call:
-    """Arguments of a call; equal if their structures, types and values are."""
+    """Arguments of a call; equal if their structures, types and values are, whatever shows its `progress`."""
 
     def __init__(self, args, kwargs):
         self.args, self.kwargs = args, kwargs
-        leaves, structure = jax.tree.flatten((args, kwargs))
+        counted = {name: value for name, value in kwargs.items() if name != "progress"}
+        leaves, structure = jax.tree.flatten((args, counted))
         arrays = map(np.asarray, leaves)
         self.key = structure, tuple((x.dtype, x.shape, x.tobytes()) for x in arrays)
 
@@ -111,7 +112,10 @@ class _Call:
 
 
 def cache_by_value(maxsize: int) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Keep the results of the last `maxsize` calls. Arguments are pytrees of arrays and numbers; results are shared."""
+    """Keep the results of the last `maxsize` calls, which are shared.
+
+    Arguments are pytrees of arrays and numbers; a keyword argument `progress` does not count.
+    """
 
     def decorate(function):
         cached = functools.lru_cache(maxsize)(lambda call: function(*call.args, **call.kwargs))
@@ -120,6 +124,7 @@ def cache_by_value(maxsize: int) -> Callable[[Callable[Arguments, Result]], Call
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             return cached(_Call(args, kwargs))
 
+        setattr(call, "cache_clear", cached.cache_clear)  # noqa: B010 (a function has no such attribute)
         return call
 
     return decorate

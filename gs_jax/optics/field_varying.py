@@ -8,8 +8,6 @@ each lens counts to first order.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -17,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64
 
-from ..base.caches import cached_on_disk
+from ..base.caches import cache_by_value, cached_on_disk
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..base.workers import map_in_threads
@@ -149,49 +147,35 @@ def field_varying_psf(
     polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
     imager, height = imager.level()
     depths = depths - float(height)
-    leaves, structure = jax.tree.flatten(imager)
-    key = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
-    return _cached_tables(_Request(key, polar_grid, rings, imager, depths, progress))
-
-
-@dataclass(frozen=True)
-class _Request:
-    """Arguments of `_cached_tables`; equal if the tables are."""
-
-    key: tuple
-    grid: PolarGrid
-    rings: tuple[float, ...] | None
-    imager: Imager = field(compare=False)
-    depths: Float64[np.ndarray, " depth"] = field(compare=False)
-    progress: Progress | None = field(compare=False)
+    return _tables(imager, depths, polar_grid, rings, progress=progress)
 
 
 # Captures of a microscope share tables, one for each type of lens; 80 MiB each at full scale.
-@lru_cache(maxsize=4)
-def _cached_tables(request: _Request) -> FieldVaryingPsf:
-    structure, *leaves = request.key
-    key = (repr((structure, request.grid, request.rings)).encode(), *leaves)
-    arrays = cached_on_disk(key, lambda: _trace_tables(request))
+@cache_by_value(maxsize=4)
+def _tables(imager: Imager, depths, grid: PolarGrid, rings, *, progress: Progress | None) -> FieldVaryingPsf:
+    """The tables of a level imager, of this process or from the disk."""
+    leaves, structure = jax.tree.flatten((imager, depths, grid, rings))
+    key = repr(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)
+    arrays = cached_on_disk(key, lambda: _trace_tables(imager, depths, grid, rings, progress))
     rings = tuple(arrays.pop("rings").tolist())
-    dtype = request.imager.sensor_distance.dtype
+    dtype = imager.sensor_distance.dtype
     # Not `jnp.asarray`, which compiles a program for each shape.
     tables = {name: jax.device_put(np.asarray(array, dtype)) for name, array in arrays.items()}
-    stray_light = StrayLight.on(request.grid, tables["table"], tables["area"], tables["sensor_distance"])
+    stray_light = StrayLight.on(grid, tables["table"], tables["area"], tables["sensor_distance"])
     names = "distortion", "light", "kernels", "wide_kernels", "harmonics", "wide_harmonics"
     return FieldVaryingPsf(**{name: tables[name] for name in names}, stray_light=stray_light, rings=rings)
 
 
-def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
-    """Arrays of `FieldVaryingPsf` and its `StrayLight`, by name."""
-    imager, depths, grid, progress = request.imager, request.depths, request.grid, request.progress
-    sharp = not request.rings and has_sharp_cores(imager, depths, grid)
-    rings = request.rings or (_SHARP_RINGS if sharp else RINGS)
+def _trace_tables(imager: Imager, depths, grid: PolarGrid, given, progress) -> dict[str, np.ndarray]:
+    """Arrays of `FieldVaryingPsf` and its `StrayLight`, by name; by default the cores decide on the rings."""
+    sharp = not given and has_sharp_cores(imager, depths, grid)
+    rings = given or (_SHARP_RINGS if sharp else RINGS)
     cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, rings, progress, oriented=sharp)
     cores.harmonics[:, :_PLAIN] = 0
     stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
     size = kernel_size(imager, grid)
     # Of each kind of pixels there is one ring at least.
-    fine = half_light_radii(cores) < _SHARP if request.rings is None else np.array(rings) <= 1
+    fine = half_light_radii(cores) < _SHARP if given is None else np.array(rings) <= 1
     inner = 1 + int(np.argmin(np.append(fine[1:-1], False)))
     # The first ring with harmonics.
     oriented = _PLAIN if sharp else len(rings)
