@@ -362,3 +362,21 @@ def _lattice(size, pitch, basis):
     steps = np.array(list(product(range(-m, m + 1), range(-n, n + 1))))[:, ::-1]
     points = pitch * (steps @ basis)
     return np.clip(points[(np.abs(points) <= half * (1 + 1e-9)).all(axis=1)], -half, half)
+
+
+def interleave(centers: Float[np.ndarray, "lens 2"], types: int) -> Int[np.ndarray, " lens"]:
+    """Assign a lens type, 0 to `types - 1`, to each lens, in about equal numbers, so that neighbours differ.
+
+    Column after column, each lens gets the type that is rarest among its six nearest neighbours so far, and of those
+    the rarest on the plate.
+    """
+    assigned = np.full(len(centers), -1)
+    if types == 1 or len(centers) == 1:
+        return assigned + 1
+    distance, near = (np.asarray(part)[:, 1:] for part in KDTree(centers).query(centers, k=min(7, len(centers))))
+    columns = np.round(centers[:, 0] / distance[:, 0].mean())
+    for lens in np.lexsort((centers[:, 1], columns)):
+        others = np.bincount(assigned[near[lens]][assigned[near[lens]] >= 0], minlength=types)
+        rare = np.bincount(assigned[assigned >= 0], minlength=types)
+        assigned[lens] = np.lexsort((rare, others))[0]
+    return assigned

@@ -18,10 +18,10 @@ from gs_jax.codesign.terms import _OURS, TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
 from gs_jax.design.start import geomscope
+from gs_jax.layouts import interleave
 from gs_jax.lenses import lenses_by_type
 from gs_jax.objectives.conditions import per_type
 from gs_jax.optics.apertures import clear_diameter
-from gs_jax.optics.lens_types import interleave
 
 
 def conics(count=12, side=4.2, *, diameter=0.8, radii=1.34):

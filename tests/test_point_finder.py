@@ -20,9 +20,9 @@ from gs_jax.design.start import geomscope
 from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.view_samples import detection_stats
+from gs_jax.layouts import interleave
 from gs_jax.metrics import localization
 from gs_jax.optics.apertures import clear_area
-from gs_jax.optics.lens_types import interleave
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.synthetic import Camera, expose, simulate, simulate_points
 

@@ -29,7 +29,7 @@ from gs_jax.detection.view_samples import (
     survival_function,
     view_quantile,
 )
-from gs_jax.optics.lens_types import MIN_SHARPNESS, sharpness
+from gs_jax.optics.psf_core import MIN_SHARPNESS, sharpness
 from gs_jax.optics.raytrace import to_numpy
 
 from .helpers import scene

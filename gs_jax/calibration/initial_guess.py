@@ -22,8 +22,7 @@ from ..base.errors import InputError
 from ..detection.background import subtract_background
 from ..geometry import Imager
 from ..lenses import EACH, MicrolensArray
-from ..optics.lens_types import FIELDS
-from ..optics.psf_core import ensquared_light
+from ..optics.psf_core import FIELDS, ensquared_light
 from ..optics.raytrace import to_numpy
 from ..typing import Image
 from .sources import CaptureFit, Sources, SpotLists, assign_spots, capture_fits

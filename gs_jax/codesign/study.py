@@ -31,8 +31,8 @@ from ..base.errors import InputError, short_repr
 from ..design.conversion import object_begins, reduced_depth, reduced_sensor_distance, sample_table
 from ..design.design import Design
 from ..io.toml import Table, one_line, read_toml
+from ..layouts import interleave
 from ..lenses import Orientation
-from ..optics.lens_types import interleave
 from ..typing import PathLike
 from .parameters import NAMES
 from .terms import GOALS, KINDS, check_term, current_name

@@ -19,8 +19,7 @@ from ..base.errors import InputError, check_kind
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
 from ..grid import Grid
-from ..optics.lens_types import FIELDS, HALF_SIDE, core_width, warn_if_blurred
-from ..optics.psf_core import ensquared_light
+from ..optics.psf_core import FIELDS, HALF_SIDE, core_width, ensquared_light, warn_if_blurred
 from ..projection.backprojection import backproject
 from ..typing import Image
 from .background import DetectionImage, Pixels, filter_bands, subtract_background
@@ -114,7 +113,7 @@ def find_points(
     Warns
     -----
     InputWarning
-        If the microscope is out of focus at the grid's depths (`gs_jax.optics.lens_types`). Not for a
+        If the microscope is out of focus at the grid's depths (`gs_jax.optics.psf_core`). Not for a
         `DetectionImage`, as of the frames of a recording.
 
     Examples

@@ -16,8 +16,8 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
 from ..optics.field_varying import FieldVaryingPsf
-from ..optics.lens_types import height_bands, split_groups, type_weights
-from ..optics.psf_core import core_distortion
+from ..optics.lens_types import height_bands, split_groups
+from ..optics.psf_core import core_distortion, type_weights
 from ..projection.forward_model import Optics, PsfModel, check_optics, psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..typing import Image

@@ -16,7 +16,7 @@ from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
 from ..grid import Grid
-from ..optics.lens_types import warn_if_blurred
+from ..optics.psf_core import warn_if_blurred
 from ..projection.backprojection import backproject, backproject_on_all_devices
 from ..projection.forward_model import FIDELITIES, Optics, check_optics
 from ..solvers.admm import ADMM

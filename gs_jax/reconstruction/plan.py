@@ -12,7 +12,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.lens_types import blur_warning, sharpness
+from ..optics.psf_core import blur_warning, sharpness
 from ..solvers.richardson_lucy import State as LucyState, restarted
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
