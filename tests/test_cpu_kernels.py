@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.optics.polar_grid import SparseTable
+from gs_jax.linear.sparse_table import SparseTable
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
 from gs_jax.projection.cpu import loading

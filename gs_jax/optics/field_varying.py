@@ -20,8 +20,9 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..base.workers import map_in_threads
 from ..geometry import Imager
+from ..linear.sparse_table import SparseTable
 from .apertures import clear_area
-from .polar_grid import PolarGrid, SparseTable, make_polar_grid, polar_weights, to_pixels_table, to_polar_table
+from .polar_grid import PolarGrid, make_polar_grid, polar_weights, to_pixels_table, to_polar_table
 from .psf_core import (
     HARMONICS,
     RINGS,

@@ -1,19 +1,18 @@
 """Polar nodes about a lens's axis, for stray light: where they are, and how light is shared by them.
 
-Sparse tables resample between square nodes (or pixels) and polar ones. They are arrays of the PSF's `StrayLight`.
+Sparse tables resample between square nodes (or pixels) and polar ones.
 """
 
 import math
 from functools import lru_cache
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Num
+from jaxtyping import Float64, Int, Num
 
 from ..geometry import Imager
+from ..linear.sparse_table import SparseTable
 from .raytrace import to_numpy
 
 # Widest field, in reduced depths of the nearest plane: beyond, a lens transmits a third of its light and less.
@@ -96,63 +95,6 @@ def polar_weights(
         parts.append((place, node, share))
     place, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
     return place, node, share
-
-
-class Entries(eqx.Module):
-    """Entries of a sparse matrix, row after row, as arrays.
-
-    `start`: the first entry of each row. `place`, `share`: column and value of each. `parts`: places and shares
-    `(row, entry)` of the rows with 1, 2, 3-4, ... entries, filled up with zeros; `order`: these rows' order in the
-    matrix. `columns`: number of columns.
-    """
-
-    start: Int[Array, " start"]
-    place: Int[Array, " entry"]
-    share: Float[Array, " entry"]
-    parts: list[tuple[Int[Array, "_ _"], Float[Array, "_ _"]]]
-    order: Int[Array, " _"]
-    columns: int = eqx.field(static=True)
-
-    @classmethod
-    def by_row(cls, row, place, share, shape: tuple[int, int]) -> "Entries":
-        """The matrix of a shape with these entries, in any order; `ValueError` if one is beyond it. Host code."""
-        rows, columns = shape
-        if row.size and not (0 <= min(row.min(), place.min()) and row.max() < rows and place.max() < columns):
-            raise ValueError(f"entries must lie within {rows} x {columns}.")
-        sorting = np.argsort(row, kind="stable")
-        start = np.searchsorted(row[sorting], np.arange(rows + 1)).astype(np.int32)
-        place, share = place[sorting].astype(np.int32), share[sorting]
-        parts, order = _equal_parts(start, place, share)
-        # Tables are kept: they must not belong to a program that is being traced.
-        with jax.ensure_compile_time_eval():
-            own = jax.device_put((start, place, share, parts, order))
-        return cls(own[0], own[1], own[2], own[3], own[4], columns)
-
-
-def _equal_parts(start, place, share):
-    count = np.diff(start)
-    size = np.ceil(np.log2(np.maximum(count, 1))).astype(int)
-    parts = []
-    for own in np.unique(size):
-        number = np.arange(max(count[size == own].max(), 1))
-        exists = number < count[size == own][:, None]
-        at = np.where(exists, start[:-1][size == own][:, None] + number, 0)
-        parts.append((np.where(exists, place[at], 0), np.where(exists, share[at], 0)))
-    return parts, np.argsort(np.argsort(size, kind="stable")).astype(np.int32)
-
-
-class SparseTable(eqx.Module):
-    """A sparse matrix by rows and by columns; `side` is that of the square of pixels."""
-
-    side: int = eqx.field(static=True)
-    rows: Entries
-    columns: Entries
-
-    @classmethod
-    def of(cls, side: int, row, column, share, shape: tuple[int, int]) -> "SparseTable":
-        rows, columns = shape
-        by_row, by_column = (row, column, share, (rows, columns)), (column, row, share, (columns, rows))
-        return cls(side, Entries.by_row(*by_row), Entries.by_row(*by_column))
 
 
 @lru_cache(maxsize=4)

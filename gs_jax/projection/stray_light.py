@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 from ..base.arrays import array_namespace
 from ..geometry import Imager
 from ..linear.linear_map import LinearMap
+from ..linear.sparse_table import times_entries
 from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
-from ..optics.polar_grid import Entries
 from .cpu.loading import kernels
 
 # Lenses whose stray light is computed at once, which bounds the memory.
@@ -31,8 +31,6 @@ _SPARE = 16
 _BLUR, _NOISE = 0.7, 0.02
 # Coarse pixels around the sensor, for that filter and for the interpolation.
 _MARGIN = 12
-# Rows of a table with at most so many entries are summed entry by entry, without a copy.
-_FEW = 8
 
 
 def stray_light_image(
@@ -204,26 +202,8 @@ def _wiener_matrix(count: int) -> Float[np.ndarray, "pixel pixel"]:
     return kernel[np.arange(count)[:, None] - np.arange(count)]
 
 
-def _times_entries(entries: Entries, x):
-    """Both directions gather whole rows: the scatter of a transpose is much slower."""
-    products = [_times_part(place, share.astype(x.dtype), x) for place, share in entries.parts]
-    return jnp.concatenate(products).at[entries.order].get(mode="promise_in_bounds")
-
-
-def _times_part(index, weight, columns):
-    def take(at):
-        return columns.at[at].get(mode="promise_in_bounds")
-
-    if index.shape[1] > _FEW:
-        return jnp.einsum("re,rec->rc", weight, take(index))
-    total = jnp.zeros((len(index), columns.shape[1]), columns.dtype)
-    for at, share in zip(index.T, weight.T, strict=True):
-        total = total + share[:, None] * take(at)
-    return total
-
-
 times_table = LinearMap(
-    lambda _, table, x: _times_entries(table.rows, x),
-    lambda _, table, y: _times_entries(table.columns, y),
+    lambda _, table, x: times_entries(table.rows, x),
+    lambda _, table, y: times_entries(table.columns, y),
     kernels=kernels("times_rows", "times_columns"),
 )
