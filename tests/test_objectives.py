@@ -101,8 +101,8 @@ def test_focus_is_one_at_the_ends_and_zero_between(focused):
 
 def alone(focused, sensor_distance, diameter):
     """One lens in the middle of the plate, which nothing clips."""
-    where = lambda c: (c.imager.sensor_distance, c.imager.array.centers, c.imager.array.aperture_diameter, c.at.cells)
-    return eqx.tree_at(where, focused, (np.array(sensor_distance), np.zeros((1, 2)), np.array(diameter), None))
+    where = lambda c: (c.imager.sensor_distance, c.imager.array.centers, c.imager.array.aperture_diameter)
+    return eqx.tree_at(where, focused, (np.array(sensor_distance), np.zeros((1, 2)), np.array(diameter)))
 
 
 def ideal(focused, sensor_distance, diameter):

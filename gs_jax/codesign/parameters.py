@@ -26,7 +26,7 @@ from ..geometry import Imager
 from ..io.toml import one_line
 from ..lenses import EACH
 from ..objectives.conditions import Conditions
-from ..optics.apertures import pitch, voronoi_cells
+from ..optics.apertures import pitch
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -169,12 +169,11 @@ def evaluated(
     exposure
         As of `Conditions`.
     free
-        Names of the parameters that will be replaced. Free lens centres take longer.
+        Names of the parameters that will be replaced.
     """
     near, far = depths_mm or design.imaging.working_distance_mm
     imager = design.imager()
     dtype = imager.sensor_distance.dtype
-    fixed = imager.array.alike and "centers_mm" not in free
     if "aspheric_terms" in free and not imager.array.aspheric_terms.size:
         imager = eqx.tree_at(lambda i: i.array.aspheric_terms, imager, jnp.zeros(_TERMS, dtype))
     at = Conditions(
@@ -182,7 +181,6 @@ def evaluated(
         circle_of_confusion,
         exposure=exposure,
         directions=_EDGES,
-        cells=voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if fixed else None,
     )
     return imager, at
 
@@ -213,7 +211,7 @@ def candidate(imager: Imager, at: Conditions, values: Values) -> tuple[Imager, C
     """An imager and its conditions with some parameters replaced; differentiable in all of them.
 
     `values`: by name, any subset of `NAMES`. A pitch scales the pattern and the plate about the middle; `centers_mm`
-    are the centres before that, and the imager's own if `at` has `cells`.
+    are the centres before that.
     """
     values = start_values(imager, at) | values
     numbers = {field: values[name] for name, field in _fields_of(imager).items()}

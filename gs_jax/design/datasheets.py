@@ -20,7 +20,6 @@ from ..layouts import check_positive, nearest_neighbour_distances
 from ..objectives.conditions import Conditions, by_type, per_type
 from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory
-from ..optics.apertures import voronoi_cells
 from ..optics.pupil import emission_lines
 from ..optics.raytrace import to_numpy, trace_lenslet
 from .design import Design
@@ -37,8 +36,7 @@ def parts_of(
     `depths` and the circle of confusion are in mm; the latter is two pixels by default.
     """
     imager = design.imager()
-    cells = voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if imager.array.alike else None
-    at = Conditions(depths, circle_of_confusion_of(design, circle_of_confusion), cells=cells)
+    at = Conditions(depths, circle_of_confusion_of(design, circle_of_confusion))
     # Computed once for the ten quantities that follow from it.
     return [
         (lens_type, dataclasses.replace(own, clear_diameter=objectives.clear_diameter(lens_type, own)))

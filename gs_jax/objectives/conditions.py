@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields, safe_sqrt
 from ..base.errors import check_kind, input_error, short_repr
 from ..geometry import Imager
-from ..optics.apertures import VoronoiCells, clear_diameter as diameter_of, clear_diameters
+from ..optics.apertures import clear_diameter as diameter_of, clear_diameters
 
 # Heights over the field at which a lens is evaluated.
 _FIELDS = 4
@@ -37,9 +37,6 @@ class Conditions(eqx.Module):
         Electrons that a mm^2 of clear aperture collects from an emitter of 40 um x 40 um, 20 mm away in air.
     directions
         Number of directions in which the edge of a clear aperture is computed, where lenses differ.
-    cells
-        Voronoi neighbours of each lens, where lenses are alike and keep them: a clear aperture is computed a hundred
-        times faster.
     clear_diameter
         Clear diameter of the lenses, mm, where it is known; computed from the imager by default.
     field_radius
@@ -60,7 +57,6 @@ class Conditions(eqx.Module):
     circle_of_confusion: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     exposure: Float[Array, ""] = eqx.field(converter=as_float, default=1e4)
     directions: int = eqx.field(static=True, default=512)
-    cells: VoronoiCells | None = None
     clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     height: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
@@ -115,7 +111,7 @@ def _per_type(imager, at, diameters):
     return [
         (
             with_array(array.of_type(number)),
-            dataclasses.replace(at, cells=None, clear_diameter=diameters[number], lenses=types == number),
+            dataclasses.replace(at, clear_diameter=diameters[number], lenses=types == number),
         )
         for number in range(array.type_count)
     ]
@@ -168,14 +164,14 @@ def with_clear_diameter(imager: Imager, at: Conditions) -> tuple[Imager, Conditi
     """An imager, and conditions that have its clear diameter."""
     if at.clear_diameter is not None:
         return imager, at
-    return imager, dataclasses.replace(at, cells=None, clear_diameter=clear_diameter(imager, at))
+    return imager, dataclasses.replace(at, clear_diameter=clear_diameter(imager, at))
 
 
 def _alone(imager: Imager, at: Conditions) -> tuple[Imager, Conditions]:
     """A lens alone, with what decides shapes of other quantities left out."""
     sensor = dataclasses.replace(imager.sensor, shape=(2, 2), origin=(0.0, 0.0))
     alone = dataclasses.replace(imager, array=imager.array.lens(0), sensor=sensor)
-    return alone, dataclasses.replace(at, cells=None, lenses=None, directions=1)
+    return alone, dataclasses.replace(at, lenses=None, directions=1)
 
 
 @eqx.filter_jit
@@ -249,13 +245,11 @@ def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     if at.clear_diameter is not None:
         return at.clear_diameter
     if array.alike:
-        return _mean_diameter(array, at.cells)
+        return _mean_diameter(array)
     return _root_mean_square(_clear_diameters(array, at.directions), array.type_of_lens)
 
 
-@jax.jit
-def _mean_diameter(array, cells):
-    return diameter_of(array, cells=cells)
+_mean_diameter = jax.jit(diameter_of)
 
 
 @partial(jax.jit, static_argnums=1)
