@@ -15,7 +15,7 @@ from rich.table import Table
 from ..base.errors import InputError
 from ..base.machine import describe
 from ..base.progress import Progress
-from ..design.datasheets import datasheet, findings, overview, format_light_path, summary, tables
+from ..design.datasheets import datasheet, findings, format_light_path, overview, summary, tables
 from ..design.design import Design, design_text, span_of
 from ..geometry import Imager
 from ..grid import Grid

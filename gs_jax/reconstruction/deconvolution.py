@@ -392,8 +392,7 @@ def choose_smoothness(
         light, spots = _binned(light, side), np.stack([sum_pixels(spot, side) for spot in psf])
         whole = ConvolutionOperator(spots, light.shape)
     kept = held_out_squares(light.shape)
-    components = lambda a: (a.components if isinstance(a, FieldConvolutionOperator) else a).kept
-    system = eqx.tree_at(components, whole, jnp.asarray(kept), is_leaf=lambda leaf: leaf is None)
+    system = eqx.tree_at(lambda a: a.kept, whole, jnp.asarray(kept), is_leaf=lambda leaf: leaf is None)
     trial = dataclasses.replace(solver, steps=_FIRST_STEPS, tolerance=0.0, tv=_FIRST)
     errors = {}
 
