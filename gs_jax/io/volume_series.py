@@ -117,9 +117,8 @@ class VolumeSeries:
         if not self._levels:
             return
         with open(self.path / JOURNAL, "rb") as file:
-            places = {note["frame"]: place for note, place in _lines(file) if not _is_other(note)}
-            for frame in sorted(places):
-                file.seek(places[frame])
+            for frame, offset in sorted(_finished(self.path).items()):
+                file.seek(offset)
                 yield frame, json.loads(file.readline())
 
     def _append(self, *notes: Note) -> None:
@@ -158,11 +157,13 @@ class VolumeSeries:
         head = _read_head(self.path)
         if head is None:
             raise input_error("store for --resume", "what an interrupted recording left", "another store", self.path)
-        count = lambda n: "those of a watched folder" if n is None else str(n)
-        now, before = ({**request, "frames": count(n)} for request, n in ((self.request, self._declared), head))
+        now, before = (
+            {**request, "frames": "those of a watched folder" if count is None else str(count)}
+            for request, count in ((self.request, self._declared), head)
+        )
         for key in dict.fromkeys([*now, *before]):
             if before.get(key) != now.get(key):
-                given, allowed = (short_repr(each[key]) if key in each else "none" for each in (now, before))
+                given, allowed = (short_repr(options[key]) if key in options else "none" for options in (now, before))
                 raise input_error(f"{key} with --resume", f"{allowed}, as before", given, self.path)
         journal = self.path / JOURNAL
         with open(journal, "rb") as file:
@@ -247,12 +248,10 @@ def check_replaceable(path: Path) -> None:
     """Raise `InputError` if the path has an unfinished recording, which `VolumeSeries` would replace."""
     if (head := _read_head(path)) is None:
         return
-    with open(path / JOURNAL, "rb") as file:
-        done = len({note["frame"] for note, _ in _lines(file) if not _is_other(note)})
-    if head[1] is None or done < head[1]:
-        frames = f"{done} frame{'s' * (done != 1)} of a watched folder"
-        if head[1] is not None:
-            frames = f"{done} of {head[1]} frames of an interrupted recording"
+    done, (_, count) = len(_finished(path)), head
+    if count is None or done < count:
+        watched = f"{done} frame{'s' * (done != 1)} of a watched folder"
+        frames = watched if count is None else f"{done} of {count} frames of an interrupted recording"
         raise InputError(f"{path}: has {frames}; give --resume to continue it, or --force to replace it.")
 
 
@@ -264,9 +263,10 @@ def _lines(file) -> Iterator[tuple[Note, int]]:
     file.seek(-len(line), os.SEEK_CUR)
 
 
-def _is_other(note: Note) -> bool:
-    """Whether a note is of a failure, or of a name, and not of a volume."""
-    return "error" in note or "name" in note
+def _finished(path: Path) -> dict[int, int]:
+    """Frames that have a volume, each with the offset of its last note in the journal of a store."""
+    with open(path / JOURNAL, "rb") as file:
+        return {note["frame"]: offset for note, offset in _lines(file) if not {"error", "name"} & note.keys()}
 
 
 def _pyramid(shape: tuple[int, ...]) -> list[tuple[int, int]]:
