@@ -178,7 +178,8 @@ def test_vmap_over_images_and_keys():
     np.testing.assert_array_equal(jax.vmap(run)(images, keys), expected)
     traces = []
     compiled = jax.jit(lambda camera: traces.append(camera) or expose(images[0], camera, KEY, peak_electrons=100.0))
-    compiled(Camera(gain=1.0)), compiled(Camera(gain=2.0))
+    for gain in (1.0, 2.0):
+        compiled(Camera(gain=gain))
     assert len(traces) == 1
 
 

@@ -192,7 +192,8 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_file_is_named(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    saved("other.tif", np.ones((40, 50))), saved("dark.tif", DARK), saved("a.tif", np.ones(SHAPE))
+    for file, pixels in (("other.tif", np.ones((40, 50))), ("dark.tif", DARK), ("a.tif", np.ones(SHAPE))):
+        saved(file, pixels)
     np.save("good.npy", np.ones(SHAPE, bool))
     for sensor in (Sensor(SHAPE, 0.01), None):
         with pytest.raises(InputError) as caught:

@@ -652,7 +652,7 @@ def test_a_failed_rename_loses_nothing(tmp_path, monkeypatch, taken):
         write_volume(path, 2 * VOLUME, GRID)
     (old,) = (folder for folder in tmp_path.iterdir() if (folder / ".zattrs").exists())
     assert (old == path) != taken and path.exists()
-    np.testing.assert_array_equal(zarr.open_group(old, mode="r")["0"][...], VOLUME)
+    np.testing.assert_array_equal(zarr.open_array(old / "0", mode="r")[...], VOLUME)
 
 
 def test_only_an_image_in_zarr_is_replaced(tmp_path):
