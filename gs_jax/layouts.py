@@ -73,7 +73,6 @@ def random_layout(
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> centers = gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1)
     >>> centers.shape
     (20, 2)

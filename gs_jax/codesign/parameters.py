@@ -126,7 +126,6 @@ def free(*names: str) -> Free:
 
     Examples
     --------
-    >>> import gs_jax as gs
     >>> gs.free("centers", "sensor_distance").names
     ('centers', 'sensor_distance')
     """

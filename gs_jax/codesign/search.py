@@ -380,7 +380,6 @@ def run_study(
     Examples
     --------
     >>> from pathlib import Path
-    >>> import gs_jax as gs
     >>> _ = Path("study.toml").write_text('''
     ... depths_mm = [18.0, 22.0]
     ... [free]

@@ -381,8 +381,6 @@ def optimize(
 
     Examples
     --------
-    >>> import gs_jax as gs, jax.numpy as jnp
-    >>> scope = gs.geomscope().imager()
     >>> loss = lambda scope: (scope.magnification(20.0) - 0.25) ** 2
     >>> found = gs.optimize(loss, scope, free=gs.free("sensor_distance"), bounds={"sensor_distance": (4.0, 8.0)})
     >>> print(round(float(found.imager.magnification(20.0)), 2))

@@ -220,7 +220,6 @@ def read_study(path: PathLike) -> Study:
     Examples
     --------
     >>> from pathlib import Path
-    >>> import gs_jax as gs
     >>> _ = Path("study.toml").write_text('''
     ... depths_mm = [18.0, 22.0]
     ... [free]

@@ -10,7 +10,6 @@ Bare equation numbers mean the GEOMScope paper.
 
 Examples
 --------
->>> import gs_jax as gs
 >>> scope = gs.geomscope().imager()
 >>> print(gs.objectives.occupancy(scope, [20.0]).round(2))  # N_e M^2, Eq. 11
 [1.11]
