@@ -151,10 +151,10 @@ def _shortened(text: str) -> str:
     """A text without most lines of long lists of numbers."""
     lines = []
     for is_list, group in groupby(text.split("\n"), lambda line: bool(line.strip() and _NUMBERS.fullmatch(line))):
-        part = list(group)
-        if is_list and len(part) > 2 * _SHOWN:
-            part = [*part[:_SHOWN], f"    # and {len(part) - _SHOWN} more"]
-        lines += part
+        rows = list(group)
+        if is_list and len(rows) > 2 * _SHOWN:
+            rows = [*rows[:_SHOWN], f"    # and {len(rows) - _SHOWN} more"]
+        lines += rows
     return "\n".join(lines)
 
 

@@ -350,8 +350,8 @@ class Light(OptionGroup):
         elif self.sample is not None or design.samples:
             changes["sample"] = sample_table(design, self.sample)
         changed = design.replace(**changes) if changes else design
-        begins, (near, far) = object_begins(changed), changed.imaging.working_distance_mm
-        return changed if near >= begins else changed.replace(working_distance_mm=(begins, far))
+        start, (near, far) = object_begins(changed), changed.imaging.working_distance_mm
+        return changed if near >= start else changed.replace(working_distance_mm=(start, far))
 
 
 @dataclass(frozen=True)

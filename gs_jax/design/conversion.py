@@ -92,21 +92,18 @@ def reduced_sensor_distance(design, distance: float, index: float | None = None)
 def object_begins(design) -> float:
     """Depth at which the default sample begins, or air beyond the filters, mm."""
     wavelength = design.imaging.wavelength_nm
-    begins = object_surface(layers_of(design.layers.object, wavelength), sample_of(default_sample(design), wavelength))
-    return float(f"{float(begins):.9g}")
+    sample = sample_of(default_sample(design), wavelength)
+    return float(f"{float(object_surface(layers_of(design.layers.object, wavelength), sample)):.9g}")
 
 
 def format_path(design) -> list[str]:
     """Layers and sample, a line each."""
-    index = lambda table: str(table.refractive_index)
-    sides = (("in front", design.layers.object), ("on the sensor", design.layers.sensor))
-    lines = [
-        f"  {side}: {', '.join(f'{layer.thickness_mm:g} mm of n = {index(layer)}' for layer in layers)}"
-        for side, layers in sides
-        if layers
-    ]
+    lines = []
+    for side, layers in (("in front", design.layers.object), ("on the sensor", design.layers.sensor)):
+        slabs = [f"{layer.thickness_mm:g} mm of n = {layer.refractive_index!s}" for layer in layers]
+        lines += [f"  {side}: {', '.join(slabs)}"] if slabs else []
     if (default := default_sample(design)) != NO_SAMPLE:
-        lines.append(f"  objects in n = {index(default)}, from z = {object_begins(design):g} mm")
+        lines.append(f"  objects in n = {default.refractive_index!s}, from z = {object_begins(design):g} mm")
     if design.samples:
         choice = " and no default" if design.sample is None else ""
         lines.append(f"  samples by name: {', '.join(design.samples)}{choice}")
@@ -131,9 +128,9 @@ def check_path(design) -> None:
     _check_sample(design, "sample", default_sample(design))
     for name, table in design.samples.items():
         _check_sample(design, f"samples.{name}", table)
-    begins, working = object_begins(design), list(design.imaging.working_distance_mm)
-    if working[1] <= begins:
-        allowed = f"beyond {begins:g} mm, where layers end and the object's medium begins"
+    start, working = object_begins(design), list(design.imaging.working_distance_mm)
+    if working[1] <= start:
+        allowed = f"beyond {start:g} mm, where layers end and the object's medium begins"
         raise ValueError(f"`imaging.working_distance_mm` must be {allowed}, got {working}")
 
 
@@ -208,8 +205,8 @@ def _lines(imaging: ImagingTable) -> tuple[Float64[np.ndarray, " line"], Float64
     part = np.minimum(np.cumsum(density) / density.sum() * _PARTS, _PARTS - 1e-9).astype(int)
     total = np.bincount(part, density, _PARTS)
     means = np.bincount(part, density * grid, _PARTS)
-    lit = total > 0
-    return means[lit] / total[lit], total[lit] / total.sum()
+    bright = total > 0
+    return means[bright] / total[bright], total[bright] / total.sum()
 
 
 def check_band(imaging: ImagingTable) -> None:
@@ -320,10 +317,10 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
 def _decimal(value: Any) -> Any:
     """Numbers, or lists of them, with the fewest decimals that reproduce them."""
     value = np.asarray(value)
-    return [_decimal(part) for part in value] if value.ndim else float(str(value[()]))
+    return [_decimal(inner) for inner in value] if value.ndim else float(str(value[()]))
 
 
 def _scaled(value: Any) -> Any:
     """Numbers, or lists of them, without the last digits, which the change of units rounds."""
     digits = np.finfo(value.dtype).precision
-    return [_scaled(part) for part in value] if value.ndim else float(f"{value:.{digits}g}")
+    return [_scaled(inner) for inner in value] if value.ndim else float(f"{value:.{digits}g}")
