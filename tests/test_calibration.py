@@ -474,7 +474,7 @@ def test_captures_that_do_not_fit_are_refused(tmp_path, monkeypatch, places, mes
             assert [line.split(":")[0] for line in lines] == names and all("pixels RMS" in line for line in lines)
         else:
             assert isinstance(told.exception, InputError) and re.search(message, str(told.exception))
-            assert len(str(told.exception)) < 380 and not (tmp_path / "wrong.png").exists()
+            assert len(str(told.exception)) < 380 and not (tmp_path / "wrong.toml.png").exists()
             assert not lines or any(": 0 of " in line for line in lines)
 
 

@@ -183,7 +183,7 @@ def test_the_command_takes_a_white_surface_alone(tmp_path, monkeypatch):
     assert "found.toml: 24 spots" in told and "the array mirrored (y to -y) and rotated" in told
     found = read_design("found.toml")
     np.testing.assert_allclose(found.imager().centers, actual.centers, atol=0.02 * actual.sensor.pixel_pitch)
-    assert found.imaging == read_design("listed.toml").imaging and (tmp_path / "found.png").exists()
+    assert found.imaging == read_design("listed.toml").imaging and (tmp_path / "found.toml.png").exists()
     assert set(found.provenance["calibrated_values"]) == {"rotation_deg", "shift_x_mm", "shift_y_mm", "scale"}
     wrong = CliRunner().invoke(commands, [*arguments, "--force", "--hold", "scale"])
     assert "apart from its neighbours, at the design's scale unless that is fitted, got" in str(wrong.exception)
