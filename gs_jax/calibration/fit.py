@@ -154,7 +154,6 @@ def calibrate(
     Examples
     --------
     >>> import dataclasses
-    >>> import gs_jax as gs, numpy as np
     >>> array = gs.MicrolensArray(gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
     >>> listed = gs.Imager(array, gs.Sensor((600, 600), 0.0135), sensor_distance=5.8, field_radius=3.0)
     >>> true = dataclasses.replace(listed, sensor_distance=5.9, rotation=0.02)

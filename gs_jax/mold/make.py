@@ -93,7 +93,6 @@ def make_mold(
     Examples
     --------
     >>> from pathlib import Path
-    >>> import gs_jax as gs
     >>> design = gs.geomscope().replace(centers_mm=[(-0.5, 0.1), (0.6, 0.0)], size_mm=(3.0, 3.0))
     >>> report = gs.make_mold(design, "mold.stl", chord=0.002)
     >>> sorted(path.name for path in Path().glob("mold.*"))
