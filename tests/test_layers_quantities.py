@@ -17,7 +17,7 @@ from gs_jax.apps.tolerances import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.linear_error import lens_electrons, lost_power
 from gs_jax.codesign.study import Study
-from gs_jax.design.datasheets import datasheet, format_light_path
+from gs_jax.design.datasheets import datasheet, overview
 from gs_jax.detection.view_samples import COARSE, search_grid
 from gs_jax.objectives.conditions import Conditions
 from gs_jax.optics.pupil import solid_angle
@@ -236,7 +236,7 @@ def test_layers_need_room():
 def test_the_report_shows_the_stack():
     wet = wet_design()
     wet = wet.replace(sample=wet.samples["water"].model_dump())
-    assert "objects in n = 1.33" in format_light_path(datasheet(wet))
+    assert "objects in n = 1.33" in " ".join(overview(wet, datasheet(wet)))
     svg = draw_section(wet)
     for label in (
         "filter, 2 mm, n = 1.461",

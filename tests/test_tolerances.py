@@ -6,6 +6,7 @@ import tomllib
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
@@ -154,7 +155,7 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
     nominal = single(), Conditions(DEPTHS, 0.01)
     spec = ToleranceSpec(layer_um=0, roughness_nm=0, tilt_deg=0, position_um=0)
     errors = jax.tree.map(lambda x: np.asarray(3 * np.asarray(x)), sampled(seed, 1, spec))
-    width, ratio = map(np.exp, log_sharpness(*nominal, errors, np.array(0.005)))
+    width, ratio = map(np.exp, log_sharpness(*nominal, errors, jnp.asarray(0.005)))
     imager = to_numpy(device_model.perturb(nominal[0], errors))
     points, weights = map(np.asarray, pupil_quadrature(0.2))
     airy = float(theory.airy_sigma(imager.wavelength, imager.sensor_distance, 0.4))

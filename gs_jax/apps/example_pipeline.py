@@ -41,8 +41,9 @@ from .pictures import downsample, draw_image
 from .report import write_report
 
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
-# Voxels of the words: each step of a solver costs a hundred back-projections.
-_WORD_DEPTHS, _WORD_VOXEL_MM = (18.0, 19.0, 20.0, 21.0, 22.0), 0.083
+# Voxels of the words. Networks see planes between and beyond theirs; each step of a solver costs a hundred
+# back-projections, so that solvers have the planes of the words.
+_WORD_DEPTHS, _WORD_PLANES, _WORD_VOXEL_MM = np.arange(17.0, 23.01, 0.5), slice(2, 11, 4), 0.083
 _STEPS = 6
 # Voxels in which points are found.
 _POINT_DEPTHS, _POINT_VOXEL_MM = np.arange(17.0, 23.01, 0.5), 0.0415
@@ -125,7 +126,8 @@ def _image_words(folder: Path, design: Design, seconds: dict, progress: Progress
     """Reconstruct words at three depths by several methods; return scores, and the contents of the page."""
     imager = design.imager()
     scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
-    grid = Grid.over(imager.sensor, depths=_WORD_DEPTHS, pitch=_WORD_VOXEL_MM)
+    planes = Grid.over(imager.sensor, depths=_WORD_DEPTHS, pitch=_WORD_VOXEL_MM)
+    grid = planes.at(planes.depths[_WORD_PLANES])
     emitters = words(_SCENE_MM)
     with _timed(seconds, "simulating words"):
         light = simulate(np.asarray(rasterize(emitters, scene_grid)), imager, scene_grid, progress=progress)
@@ -133,9 +135,10 @@ def _image_words(folder: Path, design: Design, seconds: dict, progress: Progress
     # Blurred by a voxel, so that shifts by parts of a voxel are not counted as errors.
     volumes = {_TRUTH: gaussian_filter(np.asarray(rasterize(emitters, grid)), (0, 1, 1))}
     with _timed(seconds, "back-projection"):
-        volumes["back-projection"] = plain = reconstruct(image, imager, grid, progress=progress)
+        plain = reconstruct(image, imager, planes, progress=progress)
     with progress.step("Suppressing the background"), _timed(seconds, "U-Net"):
-        volumes["back-projection + U-Net"] = suppress(plain, pretrained())
+        clean = suppress(plain, pretrained())
+    volumes |= {"back-projection": plain[_WORD_PLANES], "back-projection + U-Net": clean[_WORD_PLANES]}
     solvers = {
         f"Richardson-Lucy, {_STEPS} steps": RichardsonLucy(_STEPS, accelerate=True),
         f"ADMM, {_STEPS} steps": ADMM(_STEPS),
@@ -198,13 +201,14 @@ def _draw_words(
         low, high = np.percentile(pixels, (1, 99.8))
         draw_image(axis, pixels, area.extent, low=low, high=high, cmap="gray")
         axis.set_title(title, fontsize=13)
-    depth_range, colours = Normalize(*grid.depths[[0, -1]]), LinearSegmentedColormap.from_list("depths", _COLOURS)
+    z, colours = np.asarray(grid.depths), LinearSegmentedColormap.from_list("depths", _COLOURS)
+    depth_range = Normalize(z.min(), z.max())
     rows, columns = (abs(np.asarray(along)) < _SHOWN_MM for along in (grid.y, grid.x))
     for axis, (name, volume) in zip((*axes[0, 1:], *axes[1, 1:]), volumes.items(), strict=True):
         # Back-projection has a pedestal, which is no object.
         light = (volume - np.median(volume, (1, 2), keepdims=True))[:, rows][..., columns]
         share = np.clip(light / max(np.percentile(light.max(0), 99.7), 1e-30), 0, 1)
-        shown = (share[..., None] * np.array(colours(depth_range(grid.depths)))[:, None, None, :3]).max(0)
+        shown = (share[..., None] * np.array(colours(depth_range(z)))[:, None, None, :3]).max(0)
         draw_image(axis, shown, (-_SHOWN_MM, _SHOWN_MM, _SHOWN_MM, -_SHOWN_MM))
         axis.set_title(f"{name}\n{scores[name].psnr_db:.1f} dB PSNR" if name in scores else name, fontsize=13)
     bar = figure.colorbar(ScalarMappable(depth_range, colours), ax=axes[:, 3], ticks=[z for z, _, _ in WORDS])

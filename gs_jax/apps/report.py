@@ -15,7 +15,7 @@ from rich.table import Table
 from ..base.errors import InputError
 from ..base.machine import describe
 from ..base.progress import Progress
-from ..design.datasheets import datasheet, findings, format_light_path, overview, summary, tables
+from ..design.datasheets import datasheet, findings, overview, summary, tables
 from ..design.design import Design, design_text, span_of
 from ..geometry import Imager
 from ..grid import Grid
@@ -175,7 +175,7 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
         "sheet": sheet,
         "tables": [_cells(table) for table in tables(sheet)],
         "violations": violations,
-        "device": [summary(design, sheet), *overview(design, sheet), *filter(None, [format_light_path(sheet)])],
+        "device": [summary(design, sheet), *overview(design, sheet)],
         "keys": _device_rows(design),
         "section": section,
         "layout": layout,
