@@ -53,7 +53,7 @@ _PEAK_ELECTRONS = 10_000
 WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))
 _WORD_HEIGHT = 2.5
 # In the picture: part of the field with words, half of it, mm; pixels of the capture's middle; colours of the depths.
-_SHOWN_MM, _MIDDLE, _COLOURS = 8.6, 900, ("#3d8bff", "#ffe45c", "#ff4538")
+_SHOWN_MM, _MIDDLE, _COLOURS = 9.5, 900, ("#3d8bff", "#ffe45c", "#ff4538")
 _TRUTH, _BEST = "truth", "unrolled inversion"
 # Sentences of the page.
 _NOTES = {
