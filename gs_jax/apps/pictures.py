@@ -355,8 +355,6 @@ def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Po
 
     Examples
     --------
-    >>> import gs_jax as gs, numpy as np
-    >>> grid = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
     >>> figure = gs.show(np.random.default_rng(0).random(grid.volume_shape), grid)
     >>> figure.savefig("volume.png")
     """
