@@ -69,7 +69,7 @@ class Sensor(eqx.Module):
     @one_program
     def to_mm(self, pixels: Num[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
-        middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
+        pixels, (middle_row, middle_column) = as_float(pixels), ((n - 1) / 2 for n in self.shape)
         x = (pixels[..., 1] - middle_column) * self.pixel_pitch + self.origin[0]
         y = (pixels[..., 0] - middle_row) * self.pixel_pitch + self.origin[1]
         return jnp.stack([x, y], axis=-1)
