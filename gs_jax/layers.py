@@ -44,8 +44,8 @@ class Layers(eqx.Module):
 
     def __check_init__(self):
         if self.thickness.ndim != 1 or self.thickness.shape != self.refractive_index.shape:
-            found = f"{self.thickness.shape} and {self.refractive_index.shape}"
-            raise ValueError(f"`thickness` and `refractive_index` must be (layer,), got {found}.")
+            shapes = f"{self.thickness.shape} and {self.refractive_index.shape}"
+            raise ValueError(f"`thickness` and `refractive_index` must be (layer,), got {shapes}.")
         check_fields(self, thickness=NOT_NEGATIVE, refractive_index=INDEX)
 
     @property

@@ -11,13 +11,12 @@ from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
 from gs_jax.linear.sparse_table import SparseTable
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
@@ -317,22 +316,6 @@ def test_nothing_is_seen():
     shapes, rays, image, volume = problem(WEIGHTS[0])
     away = rays._replace(x=rays.x._replace(distance2=np.full_like(rays.x.distance2, 1e8)))
     assert not any(result.any() for result in jax.tree.leaves(run(all_three, shapes, away, image, volume)))
-
-
-@pytest.mark.integration
-def test_derivatives_in_both_modes_and_batches():
-    imager, grid = scene(jnp.float32)
-    image = jax.random.uniform(jax.random.key(0), imager.sensor.shape, jnp.float32)
-    back = lambda image, v: backproject(image, eqx.tree_at(lambda i: i.sensor_distance, imager, v), grid)
-    v = imager.sensor_distance
-    weight = jnp.cos(jnp.arange(np.prod(grid.volume_shape), dtype=jnp.float32)).reshape(grid.volume_shape)
-    by_v = jax.grad(lambda v: jnp.vdot(weight, back(image, v)))(v)
-    by_jvp = jnp.vdot(weight, jax.jvp(lambda v: back(image, v), (v,), (jnp.ones_like(v),))[1])
-    np.testing.assert_allclose(by_v, by_jvp, rtol=1e-3)
-    batch = jax.vmap(back, (0, None))(jnp.stack([image, 2 * image]), v)
-    np.testing.assert_allclose(batch[1], 2 * batch[0], rtol=1e-6)
-    (transposed,) = jax.linear_transpose(lambda image: back(image, v), image)(weight)
-    np.testing.assert_allclose(transposed, backproject_adjoint(weight, imager, grid), rtol=1e-6, atol=1e-7)
 
 
 def test_programs_may_run_at_once():

@@ -121,8 +121,8 @@ def _envelope_edges(whole: MicrolensArray, count: int, directions) -> Float[Arra
         excess = lambda direction: lambda distance: _excess(still, neighbours, direction, distance)
         return jax.vmap(lambda direction: _first_root(excess(direction), neighbours[3][0]))(directions)
 
-    def newton(found):
-        lens, at, slope = found
+    def newton(root):
+        lens, at, slope = root
         neighbours = _nearest_lenses(whole, lens)
         off = jax.vmap(lambda direction, distance: _excess(whole, neighbours, direction, distance))(directions, at)
         return at - jnp.where(slope > 0, off / jnp.where(slope > 0, slope, 1), 0)
@@ -132,7 +132,7 @@ def _envelope_edges(whole: MicrolensArray, count: int, directions) -> Float[Arra
 
 
 def _nearest_lenses(whole: MicrolensArray, lens):
-    """A lens's centre; of it and its neighbours the offsets, radii of curvature, rims, conics, and which is itself."""
+    """Return the lens's centre and, for it and its neighbours, offset, radius, rim, conic and an is-self mask."""
     radius, diameter, conic = map(whole.of_lenses, EACH)
     offset = whole.centers - whole.centers[lens][None]
     _, near = lax.top_k(-jnp.sum(offset**2, axis=1), min(_NEAREST + 1, len(whole.centers)))

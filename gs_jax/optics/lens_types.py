@@ -21,7 +21,7 @@ _BLUR, _BANDS = 2.0, 5
 
 
 def height_bands(imager: Imager) -> Int[np.ndarray, " lens"]:
-    """The number of each lens's band of height, 0 unless the array is so tilted that its lenses differ in blur."""
+    """Number the lenses by bands of height: all 0 unless the array is so tilted that its lenses differ in blur."""
     heights = np.asarray(to_numpy(imager).heights)
     low, spread = heights.min(), np.ptp(heights)
     blur = spread * float(np.max(imager.array.aperture_diameter)) / float(imager.reduced_sensor_distance)

@@ -384,8 +384,8 @@ def blur_warning(fraction: float, what: str, then: str) -> str | None:
     """Text for a `sharpness` below `MIN_SHARPNESS`: `what` needs more, else `then`; None if it is sharp enough."""
     if fraction >= MIN_SHARPNESS:
         return None
-    found = f"{fraction:.1%} of a spot's light falls into its core"
-    return f"out of focus at these depths: {found}, where {what} need {MIN_SHARPNESS:.0%}; {then}"
+    share = f"{fraction:.1%} of a spot's light falls into its core"
+    return f"out of focus at these depths: {share}, where {what} need {MIN_SHARPNESS:.0%}; {then}"
 
 
 def warn_if_blurred(imager: Imager, grid: Grid, what: str, then: str) -> None:

@@ -129,9 +129,9 @@ def _as_buffer(kernel, array):
     return array
 
 
-def _require(kernel, holds, *arrays):
-    """A kernel does not look at sizes again: others would make it read and write beyond arrays."""
-    if not holds:
+def _require(kernel, condition, *arrays):
+    """Raise `ValueError` unless arrays fit each other: a kernel does not check sizes, and would write beyond them."""
+    if not condition:
         given = ", ".join(f"{array.dtype.name}{list(array.shape)}" for array in arrays)
         raise ValueError(f"kernel {kernel}: arrays must fit each other, got {given}.")
 
@@ -162,8 +162,8 @@ def _tables(shapes, rays: Rays):
         of_rays = {axis.pixel.shape, axis.fraction.shape, axis.distance2.shape, (lenses, depths, axis.pixel.shape[2])}
         fit = len(of_rays) == 1 and 0 < axis.pixel.shape[2] <= voxels
         _require("of rays", fit and axis.start.shape in ((lenses, 1), (lenses, depths)), *axes)
-    enough = len(rays.parameters) == depths == shapes.volume[0] and rays.parameters.shape[1] > 0
-    _require("of rays", enough and min(shapes.image) >= 2 and shapes.image[1] >= WIDTH, rays.parameters)
+    complete = len(rays.parameters) == depths == shapes.volume[0] and rays.parameters.shape[1] > 0
+    _require("of rays", complete and min(shapes.image) >= 2 and shapes.image[1] >= WIDTH, rays.parameters)
     return weight_numbers(rays.weight), rays.parameters, *axes
 
 
@@ -176,7 +176,7 @@ def _pixels(shapes, image):
 
 
 def weight_numbers(weight):
-    """The kind of a weight, its limit and the slope of its falloff, those of its hole (or zero), and its scale."""
+    """Encode a weight for a kernel: kind, cutoff, falloff slope, the same for its hole (0 if none), scale."""
 
     def falloff(radius):
         exists = radius > 0
