@@ -146,15 +146,15 @@ def spots_of(device: Spots, seen: np.ndarray, distance: float, rotation: float, 
     cos, sin = np.cos(rotation), np.sin(rotation)
     centers = device.centers @ np.array([[cos, sin], [-sin, cos]]) + shift
     v = distance + centers[:, :1] * np.tan(device.tilt)
-    ends = [chief_ray(centers, place[:2], v / (place[2] + device.plate)) for place in device.places]
+    ends = [chief_ray(centers, source[:2], v / (source[2] + device.plate)) for source in device.places]
     return np.concatenate([end[lenses] for end, lenses in zip(ends, seen, strict=True)])
 
 
 def moved(which: int | slice, axis: int, by: float) -> np.ndarray:
     """Source positions, some of them displaced along x, y or z, mm."""
-    places = SOURCES.copy()
-    places[which, axis] += by
-    return places
+    sources = SOURCES.copy()
+    sources[which, axis] += by
+    return sources
 
 
 def mistakes() -> list[tuple[str, float, float]]:
@@ -201,11 +201,11 @@ def report(data: Path | None, devices: int, progress: gs.Progress) -> Report:
     columns = ("", "median deviation", "largest", "within 3 SD", "SD of the deviations, in SD")
     rows = []
     for name in NAMES if devices else ():
-        off = np.abs([each["off"][name] for each in results["devices"].values()])
-        in_sd = np.array([each["in_sd"][name] for each in results["devices"].values()])
+        off = np.abs([device["off"][name] for device in results["devices"].values()])
+        in_sd = np.array([device["in_sd"][name] for device in results["devices"].values()])
         within = f"{np.mean(np.abs(in_sd) < 3):.0%}"
         rows.append([name, f"{np.median(off):.2g}", f"{off.max():.2g}", within, f"{in_sd.std():.2f}"])
-    right = sum(each["mirrored"] for each in results["devices"].values())
+    right = sum(device["mirrored"] for device in results["devices"].values())
     head = ("what is wrong", "pixels RMS", "sensor distance, off by um")
     wrong = [[name, f"{rms:.2g}", f"{off:.2g}"] for name, rms, off in map(dict.values, results["mistakes"])]
     text = f"# Calibration\n\n{markdown_table(columns, rows)}\n\nMirrored or not: {right} of {devices} right.\n\n"

@@ -96,10 +96,10 @@ def write(folder: Path, report: Report) -> None:
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> Table:
     """Build a table for the terminal."""
-    made = Table(*columns, title=title, title_justify="left")
+    lines = Table(*columns, title=title, title_justify="left")
     for row in rows:
-        made.add_row(*row)
-    return made
+        lines.add_row(*row)
+    return lines
 
 
 def design_file(name: str) -> Path:
@@ -110,14 +110,14 @@ def design_file(name: str) -> Path:
 
 def designs_by_name(files: Sequence[Path], taken: Collection[str] = ()) -> dict[str, Design]:
     """Read designs, by name or by that of their file; raise `InputError` if two have the same name, or one is taken."""
-    found: dict[str, Design] = {}
+    designs: dict[str, Design] = {}
     for file in files:
         design = read_design(file)
         name = design.name or file.stem
-        if name in found or name in taken:
+        if name in designs or name in taken:
             raise InputError(f"designs must have names of their own, got another {name}.")
-        found[name] = design
-    return found
+        designs[name] = design
+    return designs
 
 
 def read_records(file: Path, key: str, value: Any, empty: dict[str, Any]) -> dict[str, Any]:
@@ -128,13 +128,13 @@ def read_records(file: Path, key: str, value: Any, empty: dict[str, Any]) -> dic
     if not file.exists():
         return {key: value} | empty
     try:
-        kept = json.loads(file.read_text())
+        records = json.loads(file.read_text())
     except ValueError:
-        kept = None
-    if not isinstance(kept, dict) or kept.get(key) != value:
-        got = kept.get(key, "none") if isinstance(kept, dict) else "no records"
+        records = None
+    if not isinstance(records, dict) or records.get(key) != value:
+        got = records.get(key, "none") if isinstance(records, dict) else "no records"
         raise InputError(f"{file} must be of {key} {value}, got {got}.")
-    return kept
+    return records
 
 
 def design_of(data: Path | None) -> Design:

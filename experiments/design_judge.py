@@ -96,7 +96,7 @@ class Scene(NamedTuple):
     bars: np.ndarray
 
 
-def scene(kind: str, draw: int, settings: Settings = Settings()) -> Scene:
+def make_scene(kind: str, draw: int, settings: Settings = Settings()) -> Scene:
     """A scene of a kind; each draw has other places."""
     rng = np.random.default_rng([draw, KINDS.index(kind)])
     half, turn = settings.field / 2, rng.uniform(0, 2 * np.pi)
@@ -154,9 +154,9 @@ def mark(name: str, imager: gs.Imager) -> str:
     return f"{name} {hashlib.sha256(numbers.tobytes()).hexdigest()[:8]}"
 
 
-def image_of(one: Scene, imager: gs.Imager, settings: Settings) -> np.ndarray:
+def image_of(scene: Scene, imager: gs.Imager, settings: Settings) -> np.ndarray:
     """The image without noise: the share of all light in each pixel."""
-    light = one.emitters.copy()
+    light = scene.emitters.copy()
     light[:, 3] /= light[:, 3].sum()
     if settings.images == "model":
         return image_by_model(light, imager, finer(settings.grid, settings.width))
@@ -211,17 +211,17 @@ class Methods:
 
     def volumes(self, image: np.ndarray) -> dict[str, np.ndarray]:
         """Volume by each method, Richardson-Lucy's with the number of its steps."""
-        found = {}
+        volumes = {}
         if "richardson-lucy" in self.settings.methods:
             light, _ = prepare_data(image, self.model)
             state = self.start(self.problem, light)
             for number in range(1, max(self.settings.steps) + 1):
                 state = self.step(self.problem, light, state)
                 if number in self.settings.steps:
-                    found[f"richardson-lucy {number}"] = np.asarray(self.lucy.estimate(state))
+                    volumes[f"richardson-lucy {number}"] = np.asarray(self.lucy.estimate(state))
         if "unrolled" in self.settings.methods:
-            found["unrolled"] = shared(self.unrolled(image, gs.Progress()), self.fine, self.grid)
-        return found
+            volumes["unrolled"] = shared(self.unrolled(image, gs.Progress()), self.fine, self.grid)
+        return volumes
 
 
 def finer(grid: gs.Grid, width: float) -> gs.Grid:
@@ -237,14 +237,14 @@ def shared(volume: np.ndarray, fine: gs.Grid, grid: gs.Grid) -> np.ndarray:
     return np.asarray(gs.rasterize(voxels, grid), np.float32)
 
 
-def scores(volume: np.ndarray, truth: np.ndarray, one: Scene, grid: gs.Grid) -> dict[str, Any]:
+def scores(volume: np.ndarray, truth: np.ndarray, scene: Scene, grid: gs.Grid) -> dict[str, Any]:
     """PSNR, SSIM, mean squares over the squares of a scene relative to the squared peak, and the contrast of bars."""
-    found = gs.quality(volume, truth)
-    error = ((found.gain * volume - truth) / truth.max()) ** 2
+    score = gs.quality(volume, truth)
+    error = ((score.gain * volume - truth) / truth.max()) ** 2
     squares = [part.mean() for rows in np.array_split(error, SQUARES, 1) for part in np.array_split(rows, SQUARES, 2)]
-    record = {"psnr_db": found.psnr_db, "ssim": found.ssim, "squares": [float(x) for x in squares]}
-    if len(one.bars):
-        ratio = [contrast(volume, bar, grid) / contrast(truth, bar, grid) for bar in one.bars]
+    record = {"psnr_db": score.psnr_db, "ssim": score.ssim, "squares": [float(x) for x in squares]}
+    if len(scene.bars):
+        ratio = [contrast(volume, bar, grid) / contrast(truth, bar, grid) for bar in scene.bars]
         record["contrast"] = float(np.mean(ratio))
     return record
 
@@ -260,22 +260,22 @@ def contrast(volume: np.ndarray, bar: np.ndarray, grid: gs.Grid) -> float:
 
 
 def judged(
-    imager: gs.Imager, one: Scene, clean: np.ndarray, brightest: float, methods: Methods, seed: int = 0
+    imager: gs.Imager, scene: Scene, clean: np.ndarray, brightest: float, methods: Methods, seed: int = 0
 ) -> dict[str, Any]:
     """Scores of each exposure and method; `brightest` is the brightest pixel of the reference's image."""
     grid, records = methods.grid, {}
-    truth = np.asarray(gs.rasterize(one.emitters, grid), np.float32)
+    truth = np.asarray(gs.rasterize(scene.emitters, grid), np.float32)
     for exposure in methods.settings.exposures:
         rng = np.random.default_rng([seed, exposure])
         image = rng.poisson(clean * (exposure / brightest)) + rng.normal(0, READ_NOISE, clean.shape)
         image = image.astype(np.float32)
-        tried = {name: scores(v, truth, one, grid) for name, v in methods.volumes(image).items()}
+        tried = {name: scores(v, truth, scene, grid) for name, v in methods.volumes(image).items()}
         record: dict[str, Any] = {"unrolled": tried["unrolled"]} if "unrolled" in tried else {}
         if steps := [name for name in tried if name.startswith("richardson-lucy")]:
             best = max(steps, key=lambda name: tried[name]["psnr_db"])
             record["richardson-lucy"] = tried[best] | {"steps": int(best.split()[-1])}
-        if len(one.points):
-            record["f1"] = gs.localization(gs.find_points(image, imager, grid), one.points).f1
+        if len(scene.points):
+            record["f1"] = gs.localization(gs.find_points(image, imager, grid), scene.points).f1
         records[str(exposure)] = record
     return records
 
@@ -297,16 +297,16 @@ class Judge:
                 key = f"{kind} {draw}"
                 if key in records:
                     continue
-                one, methods = scene(kind, draw, self.settings), methods or Methods(small, self.settings)
-                clean = image_of(one, small, self.settings)
-                records[key] = judged(small, one, clean, self.brightest(key, one), methods, draw)
+                scene, methods = make_scene(kind, draw, self.settings), methods or Methods(small, self.settings)
+                clean = image_of(scene, small, self.settings)
+                records[key] = judged(small, scene, clean, self.brightest(key, scene), methods, draw)
                 write_json(self.file, self.kept)
         return records
 
-    def brightest(self, key: str, one: Scene) -> float:
+    def brightest(self, key: str, scene: Scene) -> float:
         """Brightest pixel of the reference's image."""
         if key not in self.kept["scenes"]:
-            clean = image_of(one, self.reference, self.settings)
+            clean = image_of(scene, self.reference, self.settings)
             self.kept["scenes"][key] = float(clean.max())
         return self.kept["scenes"][key]
 
@@ -329,14 +329,14 @@ def mean_of(records: dict, key: str, exposure: int, read) -> float:
     return float(np.mean([read(one[str(exposure)]) for k, one in records.items() if k.startswith(f"{key} ")]))
 
 
-def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...], list[list[str]]]:
+def rows_of(by_design: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...], list[list[str]]]:
     """PSNR by each method, SSIM by the second, F1 or contrast; differences from the reference with intervals."""
-    names, first, method, rows = list(found), next(iter(found)), settings.methods[-1], []
+    names, first, method, rows = list(by_design), next(iter(by_design)), settings.methods[-1], []
     for kind in settings.kinds:
         for exposure in settings.exposures:
             row = [kind, str(exposure)]
             for name in names:
-                read = partial(mean_of, found[name], kind, exposure)
+                read = partial(mean_of, by_design[name], kind, exposure)
                 cell = " / ".join(f"{read(lambda r, m=m: r[m]['psnr_db']):.1f}" for m in settings.methods)
                 cell += f", {read(lambda r: r[method]['ssim']):.2f}"
                 if kind == "beads":
@@ -344,7 +344,7 @@ def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...]
                 if kind == "letters":
                     cell += f", bars {read(lambda r: r[method]['contrast']):.2f}"
                 if name != first:
-                    more, low, high = difference(found[name], found[first], kind, exposure, method)
+                    more, low, high = difference(by_design[name], by_design[first], kind, exposure, method)
                     cell += f" ({more:+.1f}: {low:+.1f} to {high:+.1f})"
                 row.append(cell)
             rows.append(row)
@@ -353,9 +353,9 @@ def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...]
 
 def model_error(imager: gs.Imager, kind: str, settings: Settings) -> float:
     """Error of the full model's image of a scene on fine voxels, after the best gain, relative to that by rays."""
-    small, one = device(imager, settings), scene(kind, 0, settings)
-    light = subtract_offset(image_of(one, small, settings._replace(images="rays")).astype(np.float32))
-    image = image_by_model(one.emitters, small, finer(settings.grid, settings.width))
+    middle, scene = device(imager, settings), make_scene(kind, 0, settings)
+    light = subtract_offset(image_of(scene, middle, settings._replace(images="rays")).astype(np.float32))
+    image = image_by_model(scene.emitters, middle, finer(settings.grid, settings.width))
     gain = np.vdot(image, light) / np.vdot(image, image)
     return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))
 
@@ -381,8 +381,8 @@ def report(
     imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
-    found = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
-    columns, rows = rows_of(found, settings)
+    by_design = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
+    columns, rows = rows_of(by_design, settings)
     of_model = ("design", *(f"{kind}, error of the model" for kind in IN_PLANES))
     errors = [
         [name, *(f"{model_error(imager, kind, settings):.3f}" for kind in IN_PLANES)]

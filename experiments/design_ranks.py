@@ -35,8 +35,8 @@ from experiments.design_judge import (
     device,
     diffraction_transfer,
     image_of,
+    make_scene,
     mark,
-    scene,
 )
 from experiments.ray_tracer import bundles
 from gs_jax import Design, Imager, Progress, geomscope, quality, random_layout, rasterize, read_design
@@ -144,13 +144,13 @@ def richardson_lucy(
     seen = adjoint @ np.ones((len(images), 1), np.float32)
     seen = np.maximum(seen, 0.1 * seen.mean())
     x = np.ones((len(seen), images.shape[1]), np.float32) * images.sum(0) / seen.sum()
-    found = {}
+    volumes = {}
     for number in range(1, max(STEPS) + 1):
         ratio = np.maximum(images + noise, 0) / (np.maximum(diffracted(adjoint.T @ x), 0) + noise)
         x = x * np.maximum(adjoint @ diffracted(ratio.astype(np.float32)), 0) / seen
         if number in STEPS:
-            found[number] = x
-    return found
+            volumes[number] = x
+    return volumes
 
 
 def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1)) -> dict[str, list[float]]:
@@ -159,19 +159,19 @@ def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1))
     adjoint, cases, images, truths = system(small), [], [], []
     for draw in draws:
         for kind in SETTINGS.kinds:
-            one = scene(kind, draw, SETTINGS)
-            clean = image_of(one, small, SETTINGS) * (SETTINGS.exposures[0] / brightest(kind, draw))
+            scene = make_scene(kind, draw, SETTINGS)
+            clean = image_of(scene, small, SETTINGS) * (SETTINGS.exposures[0] / brightest(kind, draw))
             rng = np.random.default_rng(draw)
             image = rng.poisson(clean) + rng.normal(0, READ_NOISE, clean.shape)
             cases.append(kind)
             images.append(sum_pixels(image, side).ravel().astype(np.float32))
-            truths.append(np.asarray(rasterize(one.emitters, grid), np.float32))
+            truths.append(np.asarray(rasterize(scene.emitters, grid), np.float32))
     rows = small.sensor.shape[0] // side
     transfer = diffraction_transfer(small, (rows, rows), side * float(small.sensor.pixel_pitch))
-    found = richardson_lucy(adjoint, transfer, np.stack(images, 1), (side * READ_NOISE) ** 2)
+    volumes_by_steps = richardson_lucy(adjoint, transfer, np.stack(images, 1), (side * READ_NOISE) ** 2)
     records: dict[str, list[float]] = {kind: [] for kind in SETTINGS.kinds}
     for number, (kind, truth) in enumerate(zip(cases, truths, strict=True)):
-        volumes = (x[:, number].reshape(grid.volume_shape) for x in found.values())
+        volumes = (x[:, number].reshape(grid.volume_shape) for x in volumes_by_steps.values())
         records[kind].append(max(quality(volume, truth).psnr_db for volume in volumes))
     return records
 
@@ -208,21 +208,21 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
 
     def brightest(kind: str, draw: int) -> float:
         if (key := f"{kind} {draw}") not in kept["bright"]:
-            kept["bright"][key] = float(image_of(scene(kind, draw, SETTINGS), reference, SETTINGS).max())
+            kept["bright"][key] = float(image_of(make_scene(kind, draw, SETTINGS), reference, SETTINGS).max())
         return kept["bright"][key]
 
     imagers = {name: design.imager() for name, design in (ranked | given).items()}
-    found = {name: kept["found"].setdefault(mark(name, imager), {}) for name, imager in imagers.items()}
+    by_name = {name: kept["found"].setdefault(mark(name, imager), {}) for name, imager in imagers.items()}
     for name, imager in progress.track(list(imagers.items()), "Designs"):
-        if "psnr_db" not in found[name]:
-            found[name]["psnr_db"] = judged(imager, brightest)
+        if "psnr_db" not in by_name[name]:
+            by_name[name]["psnr_db"] = judged(imager, brightest)
             write_json(records, kept)
     for term, name in progress.track(list(product(BETTER, ranked)), "Terms"):
-        values = found[name].setdefault("terms", {})
+        values = by_name[name].setdefault("terms", {})
         if term not in values:
             values[term] = term_of(term, imagers[name])
             write_json(records, kept)
-    return shown(*({name: found[name] for name in names} for names in (ranked, (*named, *given))))
+    return shown(*({name: by_name[name] for name in names} for names in (ranked, (*named, *given))))
 
 
 def mean_psnr(records: dict[str, Any]) -> np.ndarray:
@@ -230,22 +230,25 @@ def mean_psnr(records: dict[str, Any]) -> np.ndarray:
     return np.array([np.mean(list(r["psnr_db"].values()), axis=0) for r in records.values()])
 
 
-def shown(found: dict[str, Any], named: dict[str, Any]) -> Report:
+def shown(by_name: dict[str, Any], named: dict[str, Any]) -> Report:
     """Tables of correlations with the judge, and of the judge's means of designs that have a name."""
-    means = mean_psnr(found)
+    means = mean_psnr(by_name)
     judge = means.mean(1)
     better = np.argsort(-judge)[: len(judge) // 2]
     cell = lambda a, b: "{:.2f} ({:.2f} to {:.2f})".format(*correlation(a, b))
     both = lambda a, b: (cell(a, b), cell(a[better], b[better]))
-    values = {name: sign * np.array([r["terms"][name] for r in found.values()]) for name, sign in BETTER.items()}
+    values = {name: sign * np.array([r["terms"][name] for r in by_name.values()]) for name, sign in BETTER.items()}
     names = sorted(BETTER, key=lambda name: -spearman(judge, values[name]))
     rows = [["the judge's repeat", *both(means[:, 0], means[:, 1])]]
     rows += [[f"`{name}`", *both(judge, values[name])] for name in names]
     columns = ("objective", f"all {len(judge)} designs", "the better half")
     means = [[name, f"{psnr:.1f}"] for name, psnr in zip(named, mean_psnr(named).mean(1), strict=True)]
     tables = ((columns, rows), (("design", "the judge's mean PSNR, dB"), means))
-    files = {"design_ranks.md": "\n\n".join(markdown_table(*one) for one in tables), "design_ranks.json": found}
-    return Report(files, [table(*one) for one in tables])
+    files = {
+        "design_ranks.md": "\n\n".join(markdown_table(*columns_and_rows) for columns_and_rows in tables),
+        "design_ranks.json": by_name,
+    }
+    return Report(files, [table(*columns_and_rows) for columns_and_rows in tables])
 
 
 if __name__ == "__main__":

@@ -116,10 +116,10 @@ def numbers(results: dict) -> list[dict]:
     elements, rows = target(), []
     number = next(i for i, e in enumerate(elements) if (e.group, e.number) == (3, 2))
     for k, depth in enumerate(results["depths"]):
-        each, own = results["contrast"][k, :, number].mean(-1), results["contrast"][k, k]
+        contrasts, own = results["contrast"][k, :, number].mean(-1), results["contrast"][k, k]
         resolved = [e for e, both in zip(elements, own, strict=True) if both.min() >= RESOLVED]
         finest = max(resolved, key=lambda e: e.pairs, default=None)
-        row = {"target_mm": depth, "sharpest_mm": results["depths"][int(each.argmax())]}
+        row = {"target_mm": depth, "sharpest_mm": results["depths"][int(contrasts.argmax())]}
         row |= {"vertical": float(own[number, 0]), "horizontal": float(own[number, 1])}
         rows.append(row | {"finest": f"group {finest.group}, element {finest.number}" if finest else "none"})
     return rows

@@ -74,7 +74,7 @@ def run(design: gs.Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, pro
 
 def _judged(volume: np.ndarray, truth: np.ndarray) -> dict:
     volumes = {method: function(volume) for method, function in METHODS.items()}
-    scores = {method: gs.quality(each, truth)._asdict() for method, each in volumes.items()}
+    scores = {method: gs.quality(cleaned, truth)._asdict() for method, cleaned in volumes.items()}
     return {"volumes": volumes, "scores": scores}
 
 

@@ -245,7 +245,7 @@ def markdown(pages: dict[str, Page], seconds: dict[str, float]) -> str:
         pictures = [f"![{title}]({name})" for name in page.pictures]
         if pictures:
             parts += [f"## {title}", *pictures]
-    taken = ", ".join(f"{title.split(':')[0]} {each:.0f} s" for title, each in seconds.items())
+    taken = ", ".join(f"{title.split(':')[0]} {taken_s:.0f} s" for title, taken_s in seconds.items())
     return "\n\n".join([*parts, f"Made in {sum(seconds.values()) / 60:.0f} min: {taken}."]) + "\n"
 
 

@@ -9,7 +9,6 @@ differ in radius, conic constant and aperture. Without the authors' centres the 
 
 import dataclasses
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -46,20 +45,18 @@ def differing(imager: Imager) -> Imager:
     """The same microscope with lenses that all differ: random radii, conic constants and apertures."""
     array, random = imager.array, np.random.default_rng(0)
     draw = lambda low, high: random.uniform(low, high, len(array.centers))
-    each = {
+    numbers = {
         "radius_of_curvature": np.asarray(array.of_lenses("radius_of_curvature")) * draw(0.9, 1.1),
         "conic_constant": draw(-1.0, 0.0),
         "aperture_diameter": np.asarray(array.of_lenses("aperture_diameter")) * draw(0.6, 1.0),
     }
-    return dataclasses.replace(imager, array=dataclasses.replace(array, **each))
+    return dataclasses.replace(imager, array=dataclasses.replace(array, **numbers))
 
 
 def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     """Make the array and the mold at one chord error, write, read back and measure."""
     part, shape = Part(imager.array), MoldShape(label=label)
-    started = time.perf_counter()
     array = array_solid(part, chord_um / 1000)
-    made = time.perf_counter() - started
     mold = mold_solid(part, array, shape)
     with tempfile.TemporaryDirectory() as folder:
         meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (array, mold)]
@@ -71,7 +68,6 @@ def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),
-        "seconds": made,
         "array_volume_error": volumes[0] / array_volume(part) - 1,
         "mold_volume_error": volumes[1] / mold_volume(part, shape) - 1,
         "block_filled_error": (volumes[1] + volumes[0] + engraved) / block - 1,

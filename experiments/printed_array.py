@@ -50,22 +50,22 @@ def recipe(data: Path) -> Imager:
     return Imager(array, Sensor(SHAPE, PIXEL), DISTANCE, field_radius=100.0, wavelength=WAVELENGTH)
 
 
-def left_out(found: Calibration, start: Imager) -> np.ndarray:
+def left_out(calibration: Calibration, start: Imager) -> np.ndarray:
     """Predicted less observed spot of each lens, `(x, y)` in pixels, with a similarity fitted to the other lenses."""
     off, unknown = [], np.zeros((1, 3), bool)
-    spots, sources = found.spots.positions, found.sources
+    spots, sources = calibration.spots.positions, calibration.sources
     offsets = trace_core_offsets(start, np.zeros(0))
-    for k, lens in enumerate(found.spots.lenses):
+    for k, lens in enumerate(calibration.spots.lenses):
         others = refine([np.delete(spots, k, 0)], start, sources, unknown, PATTERN_FITTED).imager
         predicted = np.asarray(predict_spots(others, sources.points, offsets, np.zeros(1, bool)))[0, lens]
         off.append((predicted - spots[k]) / PIXEL)
     return np.array(off)
 
 
-def left_out_with_distortion(found: Calibration) -> np.ndarray:
+def left_out_with_distortion(calibration: Calibration) -> np.ndarray:
     """As `left_out`, with a stretch and a third-order term; least squares in complex numbers `x + iy`, pixels."""
-    centers = np.asarray(found.imager.array.centers, np.float64)[found.spots.lenses]
-    lens, spot = centers @ (1, 1j), found.spots.positions @ (1, 1j) / PIXEL
+    centers = np.asarray(calibration.imager.array.centers, np.float64)[calibration.spots.lenses]
+    lens, spot = centers @ (1, 1j), calibration.spots.positions @ (1, 1j) / PIXEL
     terms = np.stack([lens, np.ones_like(lens), lens.conj(), lens * abs(lens) ** 2], -1)
     hat = terms @ np.linalg.pinv(terms)
     # What a fit without one row would leave there.
@@ -73,10 +73,10 @@ def left_out_with_distortion(found: Calibration) -> np.ndarray:
     return np.stack([off.real, off.imag], -1)
 
 
-def measured_widths(image: np.ndarray, found: Calibration, pitch: float) -> np.ndarray:
+def measured_widths(image: np.ndarray, calibration: Calibration, pitch: float) -> np.ndarray:
     """Half-light radius of each lens's spot, pixels."""
-    places = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
-    return half_light_radii(image, places, np.full(len(places), pitch))
+    positions = np.asarray(calibration.imager.sensor.to_pixels(calibration.spots.positions))
+    return half_light_radii(image, positions, np.full(len(positions), pitch))
 
 
 def ray_widths(imager: Imager, depth: float) -> np.ndarray:
@@ -107,35 +107,36 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     start = recipe(data)
     image = read_capture(data / "psf.tif", SHAPE).astype(np.float64)
     image -= np.median(image)
-    found = calibrate([image], np.array([[0.0, 0.0, FAR]]), start, fit=PATTERN_FITTED, blurred=[0], progress=progress)
-    pixels_per_mm = found.values["scale"] / PIXEL
+    source = np.array([[0.0, 0.0, FAR]])
+    calibration = calibrate([image], source, start, fit=PATTERN_FITTED, blurred=[0], progress=progress)
+    pixels_per_mm = calibration.values["scale"] / PIXEL
     with progress.step("Leaving out lenses"):
-        similarity, distorted = left_out(found, found.imager), left_out_with_distortion(found)
-    lenses = found.spots.lenses
+        similarity, distorted = left_out(calibration, calibration.imager), left_out_with_distortion(calibration)
+    lenses = calibration.spots.lenses
     radius = np.asarray(start.array.of_lenses("radius_of_curvature"))[lenses]
     pitch = pixels_per_mm * float(nearest_neighbour_distances(np.asarray(start.array.centers)).mean())
-    seen = measured_widths(image, found, pitch)
+    measured = measured_widths(image, calibration, pitch)
     with progress.step("Tracing rays"):
         rays = {depth: pixels_per_mm * ray_widths(start, depth)[lenses] for depth in (FAR, *SOURCES)}
-    agree = lambda widths: float(np.corrcoef(widths, seen)[0, 1])
+    agree = lambda widths: float(np.corrcoef(widths, measured)[0, 1])
     best = max(SOURCES, key=lambda depth: agree(rays[depth]))
-    every = np.arange(len(seen))
-    others = [law(defocus_law(radius[every != k], seen[every != k]), radius[k]) for k in every]
-    numbers = defocus_law(radius, seen)
+    every = np.arange(len(measured))
+    others = [law(defocus_law(radius[every != k], measured[every != k]), radius[k]) for k in every]
+    numbers = defocus_law(radius, measured)
     rms = lambda off: float(np.sqrt((off**2).sum(-1).mean()))
     # Where a wide spot is depends on the window that looks.
-    centers = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
+    centers = np.asarray(calibration.imager.sensor.to_pixels(calibration.spots.positions))
     ones = np.ones(len(centers))
     two = [mean_shift(image, centers, width * ones, pitch / 2 * ones, pitch / 4 * ones) for width in WINDOWS]
-    wide = seen > np.median(seen)
+    wide = measured > np.median(measured)
     results = {
-        "mirrored": found.mirrored,
-        "values": found.values,
-        "standard_deviations": found.deviations,
+        "mirrored": calibration.mirrored,
+        "values": calibration.values,
+        "standard_deviations": calibration.deviations,
         "pixels_per_mm": pixels_per_mm,
         "lenses_matched": len(lenses),
         "lenses": len(start.array.centers),
-        "fit_rms_pixels": found.rms,
+        "fit_rms_pixels": calibration.rms,
         "left_out_rms_pixels": {
             "similarity": rms(similarity),
             "of_the_narrower_half": rms(similarity[~wide]),
@@ -143,7 +144,7 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
             "with_distortion": rms(distorted),
         },
         "middles_by_two_windows_differ_rms_pixels": rms(two[0] - two[1]),
-        "half_light_radius_pixels": {"least": seen.min(), "most": seen.max()},
+        "half_light_radius_pixels": {"least": measured.min(), "most": measured.max()},
         "width_correlation": {
             "rays_far_source_nothing_fitted": agree(rays[FAR]),
             "rays_best_distance": agree(rays[best]),
@@ -153,26 +154,26 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
         "best_source_distance_mm": float(best),
         "law": dict(zip(("w0_pixels", "k_pixels", "focused_radius_mm"), numbers.tolist(), strict=True)),
     }
-    shown = {"found": found, "off": similarity, "radius": radius, "seen": seen, "numbers": numbers}
+    shown = {"found": calibration, "off": similarity, "radius": radius, "seen": measured, "numbers": numbers}
     return results, shown | {"far": rays[FAR], "best": rays[best]}
 
 
 def picture(results: dict, shown: dict) -> Figure:
     """Spots with predicted places, their errors, and widths by radius. The image itself is not ours to show."""
-    found, radius = shown["found"], shown["radius"]
+    calibration, radius = shown["found"], shown["radius"]
     figure = Figure(figsize=(13, 4.4), dpi=100, layout="constrained")
     left, middle, right = figure.subplots(1, 3)
-    places = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
-    predicted = places + shown["off"][:, ::-1]
+    positions = np.asarray(calibration.imager.sensor.to_pixels(calibration.spots.positions))
+    predicted = positions + shown["off"][:, ::-1]
     (low, high), margin = (predicted.min(0), predicted.max(0)), 30
-    for place, width in zip(places, shown["seen"], strict=True):
-        left.add_patch(Circle((place[1], place[0]), width, alpha=0.4))
+    for position, width in zip(positions, shown["seen"], strict=True):
+        left.add_patch(Circle((position[1], position[0]), width, alpha=0.4))
     left.scatter(*predicted.T[::-1], marker="+", s=40, linewidths=0.8, color="k")
     left.set_title("spots, half of their light; + predicted without this lens", fontsize=9)
-    middle.scatter(*places.T[::-1], c=radius, cmap="viridis", s=14)
+    middle.scatter(*positions.T[::-1], c=radius, cmap="viridis", s=14)
     bar = figure.colorbar(middle.collections[0], ax=middle, shrink=0.8)
     bar.set_label("radius of curvature, mm")
-    middle.quiver(*places.T[::-1], *shown["off"].T, angles="xy", scale_units="xy", scale=0.2, width=0.004)
+    middle.quiver(*positions.T[::-1], *shown["off"].T, angles="xy", scale_units="xy", scale=0.2, width=0.004)
     errors = results["left_out_rms_pixels"]
     middle.set_title(f"predicted less observed, x 5: {errors['similarity']:.2f} pixels RMS", fontsize=9)
     for axis in (left, middle):

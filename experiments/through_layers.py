@@ -76,9 +76,9 @@ def on_points(data: Path, devices: dict[str, gs.Imager], progress: gs.Progress) 
     scope = devices[CASES[0]]
     image = gs.read_capture(data / "L_points.tif", scope.sensor.shape)
     results = {}
-    for (name, each), near in zip(devices.items(), (19.8, 16.0), strict=True):
-        grid = gs.Grid.over(each.sensor, depths=np.linspace(near, 24.1, 9), pitch=0.04)
-        found = gs.find_points(image, each, grid, progress=progress)
+    for (name, device), near in zip(devices.items(), (19.8, 16.0), strict=True):
+        grid = gs.Grid.over(device.sensor, depths=np.linspace(near, 24.1, 9), pitch=0.04)
+        found = gs.find_points(image, device, grid, progress=progress)
         beside = np.hypot(*(found[:, None, :2] - points[None, :, :2]).transpose(2, 0, 1))
         off = found[:, 2] - points[beside.argmin(1), 2]
         score = gs.localization(found, points)
@@ -103,15 +103,15 @@ def on_words(data: Path, devices: dict[str, gs.Imager], methods: list[str], prog
     count = 2 * int(np.ceil(np.abs(emitters[:, :2]).max() / _FINE + 1)) + 1
     fine = gs.Grid(z, (count, count), _FINE)
     results = {}
-    for name, each in devices.items():
-        model = gs.forward(gs.rasterize(emitters, fine), each, fine, gs.psf_model(each, fine, progress=progress))
+    for name, device in devices.items():
+        model = gs.forward(gs.rasterize(emitters, fine), device, fine, gs.psf_model(device, fine, progress=progress))
         results[name] = {"model": scores(np.asarray(model), electrons(image))}
         depths = np.interp(np.arange(_PLANES * (len(z) - 1) + 1) / _PLANES, np.arange(len(z)), z)
-        grid = voxel_grid(each, depths.tolist(), pixels=PIXELS_PER_VOXEL)
+        grid = voxel_grid(device, depths.tolist(), pixels=PIXELS_PER_VOXEL)
         target = np.asarray(gs.rasterize(emitters, grid), np.float32)
         empty = gs.quality(np.zeros_like(target), target).psnr_db
         for method in methods:
-            volume = gs.reconstruct(image, each, grid, METHODS[method](STEPS), progress=progress)
+            volume = gs.reconstruct(image, device, grid, METHODS[method](STEPS), progress=progress)
             results[name][method] = gs.quality(volume, target).psnr_db - empty
     return results
 

@@ -18,8 +18,8 @@ from experiments.design_judge import (
     diffracted,
     finer,
     image_of,
+    make_scene,
     report,
-    scene,
     shared,
 )
 from experiments.ray_tracer import traced
@@ -34,18 +34,18 @@ IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0
 @pytest.mark.parametrize("kind", KINDS)
 def test_scenes_lie_on_the_grid_at_all_three_depths(kind):
     settings = Settings()
-    one = scene(kind, 1, settings)
-    volume = np.asarray(rasterize(one.emitters, settings.grid), float)
-    assert volume.sum() == pytest.approx(one.emitters[:, 3].sum(), rel=1e-3)
+    scene = make_scene(kind, 1, settings)
+    volume = np.asarray(rasterize(scene.emitters, settings.grid), float)
+    assert volume.sum() == pytest.approx(scene.emitters[:, 3].sum(), rel=1e-3)
     assert (volume.reshape(3, -1).sum(1) > 0.2 * volume.sum()).all()
-    assert not np.array_equal(one.emitters, scene(kind, 2, settings).emitters)
+    assert not np.array_equal(scene.emitters, make_scene(kind, 2, settings).emitters)
 
 
 def test_the_contrast_of_bars_falls_with_blur():
     settings = Settings()
-    one = scene("letters", 0, settings)
-    truth = np.asarray(rasterize(one.emitters, settings.grid), float)
-    sharp, soft = (contrast(gaussian_filter(truth, (0, s, s)), one.bars[1], settings.grid) for s in (0, 1))
+    scene = make_scene("letters", 0, settings)
+    truth = np.asarray(rasterize(scene.emitters, settings.grid), float)
+    sharp, soft = (contrast(gaussian_filter(truth, (0, s, s)), scene.bars[1], settings.grid) for s in (0, 1))
     # A Gaussian of 40 um leaves exp(-2 (pi 40 / 120)^2) of 120 um, and light leaves the ends of the bars.
     assert 0.8 < sharp < 1.1 and soft / sharp == pytest.approx(np.exp(-2 * (np.pi / 3) ** 2), abs=0.08)
 
@@ -66,8 +66,8 @@ def test_a_point_is_blurred_to_an_airy_disc():
 def test_images_by_the_model_are_those_by_rays():
     """On one scale: electrons of the reference's brightest pixel set the exposure of all designs."""
     settings = Settings(rays=300, around=0, field=1.2, width=1.0)
-    one = scene("beads", 0, settings)
-    by_rays, by_model = (image_of(one, IMAGER, settings._replace(images=name)) for name in IMAGES)
+    scene = make_scene("beads", 0, settings)
+    by_rays, by_model = (image_of(scene, IMAGER, settings._replace(images=name)) for name in IMAGES)
     # A few rays, and the errors of the model (beads: 0.14 with many lenses).
     assert by_model.min() >= 0 and by_model.sum() == pytest.approx(by_rays.sum(), rel=0.02)
     assert np.linalg.norm(by_model - by_rays) < 0.2 * np.linalg.norm(by_rays)
@@ -123,9 +123,9 @@ def test_designs_of_one_name_are_refused(tmp_path):
 
 def test_finer_voxels_are_shared_by_those_of_the_grid():
     settings = Settings()
-    one, fine = scene("texture", 0, settings), finer(settings.grid, 0.5)
-    found = shared(np.asarray(rasterize(one.emitters, fine)), fine, settings.grid)
-    wanted = np.asarray(rasterize(one.emitters, settings.grid))
+    scene, fine = make_scene("texture", 0, settings), finer(settings.grid, 0.5)
+    found = shared(np.asarray(rasterize(scene.emitters, fine)), fine, settings.grid)
+    wanted = np.asarray(rasterize(scene.emitters, settings.grid))
     assert found.sum() == pytest.approx(wanted.sum(), rel=1e-3)
     # Shared twice, the light is spread by half a voxel more.
     assert np.corrcoef(found.ravel(), wanted.ravel())[0, 1] > 0.98
