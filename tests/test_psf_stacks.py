@@ -1,5 +1,6 @@
 """Volumes from measured stacks of PSFs: kinds of files over methods, a real capture, and what is refused."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -181,6 +182,16 @@ def test_a_volume_that_does_not_fit_into_memory_is_refused(monkeypatch):
     monkeypatch.setattr("gs_jax.reconstruction.deconvolution.available_memory", lambda: 10**5)
     with pytest.raises(InputError, match=r"free memory, got 3 x 64 x 75 voxels, .* --binning 2 takes a quarter"):
         deconvolve(capture(), spots())
+
+
+@pytest.mark.integration
+def test_the_operator_is_batched():
+    A = ConvolutionOperator(jnp.asarray(spots(), float), SHAPE)
+    scenes = jnp.asarray(np.random.default_rng(0).random((2, *A.scene_shape)))
+    images = jax.jit(jax.vmap(A.mv))(scenes)
+    np.testing.assert_allclose(images[1], A.mv(scenes[1]), rtol=1e-12)
+    back = jax.jit(jax.vmap(A.T.mv))(images)
+    np.testing.assert_allclose(jnp.vdot(images, images), jnp.vdot(back, scenes), rtol=1e-12)
 
 
 def test_a_real_capture_is_explained():
