@@ -219,7 +219,7 @@ def tolerance_command(
             "seed": seed,
             "progress": progress,
         }
-        result = tolerance(microscope, chosen, **options, **targets, progress=progress)
+        result = tolerance(microscope, chosen, **options, **targets)
     if output and drawing:
         provenance = provenance_of(design, tolerances, positions, design=microscope)
         write_json(output, {KEY: provenance, "seed": seed} | as_json(result))
