@@ -43,8 +43,7 @@ from .base import (
 # The penalty changes by a factor where one residual is this many times the other (Boyd, section 3.4.1), and only so
 # many times: convergence is proven for a penalty that is constant from some step on.
 _BALANCE, _FACTOR, _MAX_CHANGES = 10.0, 2.0, 50
-# On images of particles and of letters, 1.8 gives a lower cost with conjugate gradients than 1 after as many steps, and
-# about the same as 1.6.
+# With conjugate gradients, 1.8 gives a lower cost than 1 on images of particles and letters, about the same as 1.6.
 _RELAXATION = 1.8
 # Initial penalty of the convolved scene, relative to the image's weight. With 1 or 0.01 the cost falls more slowly, on
 # both captures of DiffuserCam and on random ones.
@@ -131,7 +130,7 @@ class State(NamedTuple):
     """State of `ADMM`: the iterate, the sums of the differences and of the copy of `x`, and `back = A' image`."""
 
     iterate: Iterate
-    sums: tuple[Array, Array]
+    sums: tuple[Array, ...]
     penalty: Penalty
     weights: Weights
     back: Array
@@ -206,16 +205,14 @@ class ADMM(eqx.Module):
         right_side = back + rho * (differences_adjoint(u) + w)
         iterate = _conjugate_gradients(A, smooth, right_side, iterate, self.cg_steps)
         split = weights.splits * differences(iterate.x), iterate.x
-        squares, new_sums = jnp.zeros(5, image.dtype), []
-        for x, total, old, new in zip(split, sums, before, after, strict=True):
-            total, z = _next_sum(x, total, old, factor)
-            squares = squares + _squares(x, z, total, new(total))
-            new_sums.append(total)
+        pairs = [_next_sum(x, s, old, factor) for x, s, old in zip(split, sums, before, strict=True)]
+        sums = tuple(total for total, _ in pairs)
+        squares: Any = sum(_squares(x, z, s, new(s)) for x, (s, z), new in zip(split, pairs, after, strict=True))
         penalty, residual = _balanced(rho, squares, penalty.changes)
         misfit = iterate.image - image
         variation = total_variation(split[0], isotropic=self.isotropic)
         cost = jnp.vdot(misfit, misfit) / 2 + weights.tv * variation + weights.l1 * jnp.sum(jnp.abs(iterate.x))
-        return State(iterate, tuple(new_sums), penalty, weights, back), cost, residual
+        return State(iterate, sums, penalty, weights, back), cost, residual
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return self._prox(state.weights, state.penalty.rho)[1](state.sums[1])
@@ -251,10 +248,7 @@ def _conjugate_gradients(A, smooth, right_side, iterate, steps):
 
 
 def _mean_gain(A):
-    """Mean diagonal entry of `A'A` by Hutchinson's estimate.
-
-    A penalty of this size weighs the split like the image.
-    """
+    """Mean diagonal entry of `A'A` by Hutchinson's estimate: a penalty of this size weighs the split like the image."""
     structure = A.in_structure()
     signs = jax.random.rademacher(jax.random.key(0), structure.shape, structure.dtype)
     image = A.mv(signs)
@@ -316,10 +310,9 @@ class ConvolutionADMM(eqx.Module):
     `A.scene_shape`; `A.window` is the image's place in it.
 
     The convolved scene has its own penalty `rho / gain^2`, where `gain^2` is the geometric mean of the largest and the
-    mean eigenvalue of `A'A` for the mean plane. For one split the best penalty is the geometric mean of the extreme
-    eigenvalues (Ghadimi et al., IEEE Trans. Autom. Control 60, 644, 2015); the smallest of a diffuser is 0, hence the
-    mean. With the mean alone, low spatial frequencies, up to `max / mean` times as strong (4e5 for 2 million pixels),
-    outweigh the regularizer, which then acts slowly.
+    mean eigenvalue of `A'A` for the mean plane. For one split the best penalty is that of the extreme eigenvalues
+    (Ghadimi et al., IEEE Trans. Autom. Control 60, 644, 2015), but the smallest of a diffuser is 0. With the mean,
+    low spatial frequencies, up to 4e5 times as strong for 2 million pixels, outweigh the regularizer.
 
     Parameters
     ----------
