@@ -158,10 +158,9 @@ def _image_words(folder: Path, design: Design, seconds: dict, progress: Progress
 
 def _image_points(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[np.ndarray, Localization]:
     imager = design.imager()
-    truth = random_points(_POINTS, (20.0, 20.0), (18.0, 22.0), seed=1)
+    truth = random_points(_POINTS, (20.0, 20.0), (19.0, 21.0), seed=1)
     with _timed(seconds, "simulating points"):
-        # By rays alone, without stray light: its tables for seventeen depths take as long as all else.
-        light = simulate(truth, imager, optics="near", psf="geometric", progress=progress)
+        light = simulate(truth, imager, progress=progress)
         image = _expose(light, folder / "points.tif", seed=1)
     with _timed(seconds, "finding points"):
         grid = Grid.over(imager.sensor, depths=_POINT_DEPTHS, pitch=_POINT_VOXEL_MM)
