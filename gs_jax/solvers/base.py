@@ -283,9 +283,13 @@ def _for_one_step(solver):
     return dataclasses.replace(solver, steps=1, tolerance=0.0)
 
 
-@jax.jit
 def estimate_of(solver: Any, state: Any) -> Any:
     """`solver.estimate`, by one compiled program."""
+    return _estimate(_for_one_step(solver), state)
+
+
+@jax.jit
+def _estimate(solver, state):
     return solver.estimate(state)
 
 
