@@ -11,6 +11,7 @@ from matplotlib.patches import Arc, Circle, Polygon, Rectangle
 
 from gs_jax.design.start import FRAME, Key, design_keys
 
+LAYERS = ("layers.object", "layers.sensor", "sample.layers")  # have the same keys
 HERE = Path(__file__).parent
 PAGE, DRAWING = HERE / "KEYS.md", HERE / "geometry.svg"
 HEAD = f"""# Keys of a design file
@@ -21,8 +22,7 @@ HEAD = f"""# Keys of a design file
 
 ![Side view and image, with axes and distances](geometry.svg)
 
-`gs-jax new-design -o my.toml` writes a file with these descriptions as comments, from prompts or options; edit it by
-hand afterwards. Missing or extra keys, invalid values and inconsistent parts are reported in one line. Valid but
+`gs-jax new-design -o my.toml` writes a file with these descriptions as comments, from prompts or options. Valid but
 unusual values cause a question: `sensor_distance_mm = 5800: did you mean 5.8 mm (5800 um)?`
 """
 TAIL = """
@@ -47,34 +47,18 @@ Columns `radius_of_curvature_mm`, `aperture_diameter_mm` and `conic_constant` ho
 the keys of these names in `[lens]`.
 
 Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel, x the column, y the row. `mirror` turns
-the plate over about its y axis, x to -x; turning it over about its x axis is the same plus half a turn.
-`gs-jax calibrate` detects mirroring itself, and estimates rotation and shift.
+the plate over about its y axis, x to -x. `gs-jax calibrate` detects mirroring itself.
 
 ## Filters, windows and samples
 
-```toml
-[[layers.object]]                    # on the plate: an emission filter
-thickness_mm = 2.0
-refractive_index = "fused silica"
-[[layers.sensor]]                    # the gap between the chip and its window
-thickness_mm = 0.6
-[[layers.sensor]]
-thickness_mm = 0.55
-refractive_index = "BK7"
-[samples.gel]                        # gs-jax reconstruct capture.tif my.toml --sample gel ...
-refractive_index = "PDMS"
-surface_mm = 19.67
-layers = [{ name = "cover slip", thickness_mm = 0.17, refractive_index = 1.523 }]
-```
-
-Depths and the sensor distance stay lengths as a ruler measures them. A material's index follows the wavelength; it is
-relative to air. The order of layers counts for reflection losses alone.
+An [example](../docs/howto/samples.md#list-them-in-the-design-file) shows them. A material's index follows the
+wavelength; it is relative to air.
 
 ## In an editor
 
 `gs-jax new-design --schema > gs-jax.schema.json` writes the JSON schema of design files. With the first line
 `#:schema ./gs-jax.schema.json` in a design beside it, editors with Taplo (in VS Code: "Even Better TOML") complete and
-describe keys and underline errors, without a network; `taplo lint my.toml` checks in a terminal.
+describe keys and underline errors; `taplo lint my.toml` checks in a terminal.
 """
 
 
@@ -85,11 +69,14 @@ def page() -> str:
         tables.setdefault(key.table, []).append(key)
     lines = [HEAD]
     for table, keys in tables.items():
+        if table in LAYERS[1:]:
+            continue
         shown = [key for key in keys if key.allowed != "a table"]
-        lines += [f"## `{_heading(table)}`" if table else "## At the top", ""]
-        if table:
+        headings = [f"`{_heading(name)}`" for name in (LAYERS if table == LAYERS[0] else (table,)) if name]
+        lines += [f"## {', '.join(headings) or 'At the top'}", ""]
+        if table and table != LAYERS[0]:
             lines += [f"{design_keys()[table].meaning.capitalize()}.", ""]
-        lines += ["| key | unit | meaning | allowed | usual |", "|---|---|---|---|---|"]
+        lines += ["| key | meaning | allowed |", "|---|---|---|"]
         lines += [_row(key) for key in shown]
         lines.append("")
     lines.append(f"`[samples.NAME]`: {design_keys()['samples'].meaning}.\n")
@@ -103,7 +90,8 @@ def _heading(table: str) -> str:
 
 def _row(key: Key) -> str:
     needed = "" if key.required else " (optional)"
-    cells = (f"`{key.name}`{needed}", key.unit, key.meaning, key.allowed, key.usual)
+    usual = f"; usually {key.usual}" if key.usual else ""
+    cells = (f"`{key.name}`{needed}", key.meaning, f"{key.allowed}{usual}")
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
