@@ -148,7 +148,7 @@ WRONG = {
     "mat": (("psf.mat",), "got '.mat'; convert it: numpy.save('a.npy', scipy.io.loadmat('a.mat')['NAME']"),
     "wiener": (("psf.tif", "--method", "wiener"), "wiener must be used with one PSF, for one plane, got 3; admm takes"),
     "dark": (("dark.npy",), "got no light above the darkest percent in plane 2."),
-    "weight": (("psf.tif", "--method", "fista", "--tv-z", "2"), "--tv-z must be used with --method admm, got fista."),
+    "weight": (("psf.tif", "--method", "fista", "--tv-z", "2"), "--tv-z must be used with admm, got --method fista."),
     "page": (("psf.tif", "--psf-page", "4"), "must be 1 to 3, or mean, got --page 4 of 3 pages"),
     "nothing": (("none.tif",), "none.tif: cannot be read: No such file or directory."),
 }

@@ -47,6 +47,8 @@ def _own_encoding(call: ast.Call) -> bool:
         # Our own `read_text(path)` and `write_text(path, text, suffixes)` are plain functions, and say UTF-8.
         return isinstance(call.func, ast.Attribute) and len(call.args) <= TEXT[name]
     # Of a path or of Python; what other libraries open is theirs.
+    if isinstance(call.func, ast.Attribute) and getattr(call.func.value, "id", "") == "zarr":
+        return False
     place = 1 if isinstance(call.func, ast.Name) else 0
     given = call.args[place] if len(call.args) > place else None
     mode = given.value if isinstance(given, ast.Constant) else "r"

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..base.arrays import jit, safe_sqrt
+from ..base.arrays import jit, one_program, safe_sqrt
 from ..lenses import EACH, MicrolensArray, sag
 
 # Lenses computed at once, and neighbours that may bound a lens. A cell of a random layout has six on average.
@@ -178,6 +178,7 @@ def _first_root(function, end):
     return at, jax.grad(function)(at)
 
 
+@one_program
 def clear_diameter(array: MicrolensArray) -> Float[Array, ""]:
     """Diameter of the disc with the mean clear aperture of the lenses, mm."""
     everywhere = jnp.ones((1, len(array.centers)), bool)

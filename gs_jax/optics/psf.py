@@ -212,11 +212,8 @@ def psf_of_depth(
     """
     imager, height = imager.level()
     radius = clear_diameter(imager.array) / 2
-    # All zones: near the focus of the rim's rays those of other zones land farther out.
-    fan = radius * jnp.linspace(0, 1, _FAN)[:, None] * jnp.array([[1.0, 0.0]])
-    lines, ends = emission_lines(imager), (min(depths) - float(height), max(depths) - float(height))
-    rays = [[trace_lenslet(one, depth, fan) for _, one in lines] for depth in ends]
-    reaches = [max(float(jnp.where(r.valid, jnp.abs(r.landing[:, 0]), 0).max()) for r in each) for each in rays]
+    ends = [float(depth) - float(height) for depth in (min(depths), max(depths))]
+    reaches = [float(_reach(imager, depth, radius)) for depth in ends]
     pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
     if not pixels <= _FARTHEST:
         depth = ends[int(np.argmax(reaches))]
@@ -225,15 +222,30 @@ def psf_of_depth(
             f"{depth:g} mm."
         )
     size = steps * (2 * math.ceil(pixels + _WINDOW_MARGIN) + 1)
-    make = PSFS[kind]
-    if kind == "diffraction":  # as fine as the aperture diffracts
-        make = partial(make, samples=math.ceil(least_samples(imager, 2 * radius)))
+    # As fine as the aperture diffracts.
+    samples = math.ceil(least_samples(imager, 2 * radius)) if kind == "diffraction" else None
 
-    def mean_psf(depth):
-        each = [weight * make(one, depth - float(height), size=size, radius=radius) for weight, one in lines]
-        return jnp.sum(jnp.stack(each), 0)
+    def psf(depth):
+        return _mean_psf(imager, depth - float(height), radius, kind=kind, size=size, samples=samples)
 
-    return mean_psf
+    return psf
+
+
+@jit
+def _reach(imager: Imager, depth, radius):
+    """Largest distance on the sensor of a ray from a point on the axis, mm, over the emission band."""
+    # All zones: near the focus of the rim's rays those of other zones land farther out.
+    fan = radius * jnp.linspace(0, 1, _FAN, dtype=radius.dtype)[:, None] * jnp.array([[1.0, 0.0]], radius.dtype)
+    rays = [trace_lenslet(line, depth, fan) for _, line in emission_lines(imager)]
+    return jnp.max(jnp.stack([jnp.where(r.valid, jnp.abs(r.landing[:, 0]), 0) for r in rays]))
+
+
+@partial(jit, static_argnames=("kind", "size", "samples"))
+def _mean_psf(imager: Imager, depth, radius, *, kind: str, size: int, samples: int | None):
+    """The mean PSF over the emission band."""
+    make = PSFS[kind] if samples is None else partial(PSFS[kind], samples=samples)
+    psfs = [weight * make(line, depth, size=size, radius=radius) for weight, line in emission_lines(imager)]
+    return jnp.sum(jnp.stack(psfs), 0)
 
 
 @jit

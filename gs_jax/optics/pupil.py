@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
-from ..base.arrays import array_namespace
+from ..base.arrays import array_namespace, one_program
 from ..geometry import Imager
 from ..layers import object_indices
 from ..lenses import EACH, MicrolensArray, sag
@@ -248,6 +248,14 @@ def emission_lines(imager: Imager) -> list[tuple[Scalar, Imager]]:
         if shift.shape[1:] != part.refractive_index.shape:
             shape = *shift.shape[:1], *part.refractive_index.shape
             raise ValueError(f"`band` must have {shape} refractive indices of a part of the imager, got {shift.shape}.")
+
+    return _lines(imager)
+
+
+@one_program
+def _lines(imager: Imager) -> list[tuple[Scalar, Imager]]:
+    band, parts = imager.band, _dispersive(imager)
+    assert band is not None
 
     def line(k):
         indices = [part.refractive_index + shift[k] for part, shift in parts]
