@@ -98,7 +98,7 @@ def imports_of(*folders: str) -> set[tuple[str, str]]:
 
 
 def test_the_physics_knows_no_files_and_solvers_no_microscope():
-    """As the design notes say."""
+    """As `CONTRIBUTING.md` says."""
     physics = imports_of("geometry", "lenses", "layers", "optics", "objectives", "projection")
     assert not {(module, other) for module, other in physics if other in ("io", "design", "simulation")}
     of_solvers = {
