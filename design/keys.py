@@ -91,7 +91,7 @@ def _heading(table: str) -> str:
 def _row(key: Key) -> str:
     needed = "" if key.required else " (optional)"
     usual = f"; usually {key.usual}" if key.usual else ""
-    cells = (f"`{key.name}`{needed}", key.meaning, f"{key.allowed}{usual}")
+    cells = (f"`{key.name}`{needed}", key.meaning, f"{key.allowed.removeprefix('a number of ')}{usual}")
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
