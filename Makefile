@@ -10,7 +10,7 @@ TYPED := --jaxtyping-packages=gs_jax,beartype.beartype
 # Libraries older or newer than the others warn of each other, and other versions of JAX compile other programs.
 SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -o compile_budget= -m "not slow" \
 	$(addprefix tests/test_,imports.py linear_map.py cpu_kernels.py operators.py shipped_capture.py solve.py files.py \
-	mold_files.py layers.py solvers.py::test_it_finds_two_bright_voxels \
+	mold_files.py layers.py solvers.py::test_it_finds_two_bright_voxels_and_nothing_in_the_dark \
 	apertures.py::test_a_compiled_lens_does_not_bound_itself)
 # Of the oldest Python, which has the lowest versions; of the newest at hand.
 LOWEST := .venv-lowest/bin/python

@@ -217,3 +217,11 @@ def test_workflows_call_existing_targets():
     }
     assert set(calls) == {"tests", "docs", "nightly", "wheels"} and all(calls.values())
     assert set().union(*calls.values()) <= targets
+
+
+def test_the_short_suite_names_existing_tests():
+    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (listed,) = re.findall(r"addprefix tests/test_,(.*?)\)", text.replace("\\\n", " "), re.DOTALL)
+    for name in listed.split():
+        path, _, test = name.partition("::")
+        assert f"def {test}" in (ROOT / "tests" / f"test_{path}").read_text(encoding="utf-8"), name
