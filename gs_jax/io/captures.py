@@ -147,7 +147,7 @@ def open_source(path: Path, page: int | str | None = None) -> Iterator[Source]:
         pixels = open_npy(path)
         pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
         names = [f"{path.name}, page {page}" for page in range(1, len(pages) + 1)]
-        read = lambda index, selection: _read_array(path, pages[index], selection)
+        read = lambda index, selection: _read_array(path, np.asarray(pages[index]), selection)
         yield Source([(UNNAMED, len(pages))], pages.shape[1:], names, read, [path])
     else:
         yield Source([(UNNAMED, 1)], (), [path.name], lambda _, selection: _read_png(path, selection), [path])

@@ -58,7 +58,7 @@ class PsfModel(eqx.Module):
         not matter.
     """
 
-    parts: tuple[Float[Array, "plane tall wide"] | FieldVaryingPsf | None, ...]
+    parts: tuple[Float[Array, "plane _ _"] | FieldVaryingPsf | None, ...]
     lenses: tuple[tuple[int, ...], ...] | None = eqx.field(static=True)
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     pixel_pitch: Float[Array, ""] = eqx.field(converter=as_float)
