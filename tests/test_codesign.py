@@ -7,7 +7,7 @@ from gs_jax.base.errors import InputError
 from gs_jax.codesign import search
 from gs_jax.codesign.parameters import start_values
 from gs_jax.codesign.search import Log, problem_of, read_checkpoint, run_study
-from gs_jax.codesign.search_report import before_and_after, check_outputs, picture, write_outcome
+from gs_jax.codesign.search_report import before_and_after, picture, write_outcome
 from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.design.design import read_design, write_design
@@ -76,7 +76,6 @@ def test_only_what_is_free_changes(table1, outcome):
 
 def test_files(table1, outcome, tmp_path):
     path = tmp_path / "new.toml"
-    check_outputs(path)
     paths = write_outcome(path, outcome, parent="a/table1.toml", source="b/study.toml")
     assert [p.name for p in paths] == ["new.toml", "new.toml.json", "new.toml.png"] and all(p.exists() for p in paths)
     written = read_design(path)

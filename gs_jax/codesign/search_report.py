@@ -15,7 +15,7 @@ from rich.table import Table
 from ..design.datasheets import six_digits
 from ..design.design import Design, write_design
 from ..design.validation import of_each
-from ..io.files import check_output, side_file, write_figure, write_json
+from ..io.files import side_file, write_figure, write_json
 from ..io.provenance import Provenance
 from ..layouts import plate_corners
 from ..lenses import lenses_by_type
@@ -153,13 +153,6 @@ def _draw_layout(axes: Axes, design: Design) -> None:
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", xlabel="x, mm", ylabel="y, mm")
     axes.set_title(f"{len(discs)} lenses, D = {max(diameters):.3g} mm")
     axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
-
-
-def check_outputs(path: Path) -> None:
-    """Raise `InputError` unless the design, the numbers and the picture can be written."""
-    check_output(path, [".toml"])
-    for beside in side_files(path):
-        check_output(beside, [beside.suffix])
 
 
 def side_files(path: Path) -> list[Path]:
