@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from .base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields, one_program
+from .base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields, native, one_program
 
 
 class Sensor(eqx.Module):
@@ -66,10 +66,15 @@ class Sensor(eqx.Module):
         column = (points[..., 0] - self.origin[0]) / self.pixel_pitch + middle_column
         return (np if isinstance(points, np.ndarray) else jnp).stack([row, column], axis=-1)
 
-    @one_program
     def to_mm(self, pixels: Num[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
-        pixels, (middle_row, middle_column) = as_float(pixels), ((n - 1) / 2 for n in self.shape)
+        middle = tuple((n - 1) / 2 for n in self.shape)
+        if not isinstance(pixels, Array):  # float64 of NumPy loses no digits before the middle is subtracted
+            pixels, middle = native(pixels) - np.array(middle), (0.0, 0.0)
+        return self._scaled(as_float(pixels), *middle)
+
+    @one_program
+    def _scaled(self, pixels, middle_row, middle_column):
         x = (pixels[..., 1] - middle_column) * self.pixel_pitch + self.origin[0]
         y = (pixels[..., 0] - middle_row) * self.pixel_pitch + self.origin[1]
         return jnp.stack([x, y], axis=-1)

@@ -272,10 +272,11 @@ def test_unknown_coordinates_of_sources_are_found(seed, points, hidden, of, held
     fit = [name for name in FITTED if name != held]
     found = calibrate(captures(actual, points, of), given, design, captures=np.array(of), fit=fit)
     check(found, actual, [name for name in NAMES if not held or held not in name])
-    # Of two unknown sources in one capture, nobody said which is which.
-    places = found.sources.points[KDTree(found.sources.points).query(points)[1]]
-    np.testing.assert_allclose(places[:, :2], points[:, :2], atol=5e-3)
-    np.testing.assert_allclose(places[:, 2], points[:, 2], atol=0.05)
+    sources = found.sources.points
+    if of == [0, 1, 1] and abs(sources[1, 0] - points[1, 0]) > 0.5:  # nobody said which of the two is which
+        sources = sources[[0, 2, 1]]
+    np.testing.assert_allclose(sources[:, :2], points[:, :2], atol=5e-3)
+    np.testing.assert_allclose(sources[:, 2], points[:, 2], atol=0.05 if len(points) == 9 else 5e-3)
     assert len(found.residuals) > (60 if len(points) == 9 else 20)
 
 

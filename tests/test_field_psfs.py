@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from jax.test_util import check_grads
 from scipy.signal import convolve2d
 
-from gs_jax import FISTA, ConvolutionADMM, InputError, write_capture
+from gs_jax import FISTA, ConvolutionADMM, InputError, solve, write_capture
 from gs_jax.__main__ import commands
 from gs_jax.linear.measured_psf import FieldConvolutionOperator
 from gs_jax.reconstruction.deconvolution import deconvolve, run_deconvolution
@@ -53,6 +53,8 @@ def test_the_operator_is_the_sum_of_weighted_convolutions_with_an_exact_adjoint(
         assert A.scene_shape == scene.shape
         return A.mv(scene), A.T.mv(image)
 
+    with pytest.raises(InputError, match="must be used with a ConvolutionOperator, got FieldConvolutionOperator"):
+        solve(FieldConvolutionOperator(kernels, weights, (9, 10)), image, ConvolutionADMM(steps=1))
     forth, back = map(np.asarray, both(kernels, weights, scene, image))
     np.testing.assert_allclose(np.vdot(forth, image), np.vdot(scene, back), rtol=1e-12)
 

@@ -191,6 +191,8 @@ WRONG_POINTS = {
     "word": (b"x_mm,y_mm,z_mm,intensity\n1,2,3,4\n1,2,x,4\n", ["line 3", "z_mm", "'x'"]),
     "nan": (b"x_mm,y_mm,z_mm,intensity\n1,2,3,nan\n", ["line 2", "intensity", "'nan'"]),
     "inf": (b"x_mm,y_mm,z_mm,intensity\n1,2,inf,1\n", ["line 2", "z_mm", "'inf'"]),
+    "separators": (b"x_mm;y_mm;z_mm;intensity\n1,2,3,4\n", ["line 2", "4 values", "got 1 values"]),
+    "blanks": (b"x_mm,y_mm,z_mm,intensity\n1,2,3,4\n  \n", ["line 3", "got 1 values"]),
     "comma": (b"x_mm,y_mm,z_mm,intensity\n1,5,2,5,18,0,1,0\n", ["line 2", "got 8 values"]),
     "behind": (b"x_mm,y_mm,z_mm,intensity\n1,2,20,1\n1,2,-20,1\n", ["point 2", "z_mm", "-20.0", "above 0"]),
     "dark": (b"x_mm,y_mm,z_mm,intensity\n1,2,20,-1\n", ["point 1", "intensity", "-1.0", "0 or more"]),

@@ -1,7 +1,9 @@
 """STL and 3MF as other programs read them, and what is measured in them."""
 
 import struct
+import zipfile
 
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
@@ -70,6 +72,17 @@ def test_a_file_is_watertight_for_others_and_reads_back(tmp_path, suffix):
     again = read_mesh(path)
     np.testing.assert_array_equal(np.float32(again.vertices), mesh.vertices)
     np.testing.assert_array_equal(np.sort(again.facets, axis=0), np.sort(mesh.facets, axis=0))
+
+
+def test_units_of_a_file_are_converted(tmp_path):
+    path, other = tmp_path / "a.3mf", tmp_path / "inch.3mf"
+    mesh = float32_mesh(manifold3d.Manifold.cube([1.0, 1.0, 1.0]))
+    write_mesh(path, mesh, "a")
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(other, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name).replace(b'unit="millimeter"', b'unit="inch"'))
+    for file, unit in ((path, 1.0), (other, 25.4)):
+        np.testing.assert_allclose(np.ptp(read_mesh(file).vertices, axis=0), unit, rtol=1e-6)
 
 
 def test_vertices_that_float32_cannot_tell_apart_are_merged():

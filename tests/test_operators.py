@@ -194,6 +194,17 @@ def test_hessian_vector_products_are_differences_of_gradients(name):
         np.testing.assert_allclose(ours, numeric, rtol=1e-4, atol=1e-5 * np.abs(numeric).max())
 
 
+@pytest.mark.integration
+def test_second_derivatives_are_those_of_reverse_passes_too():
+    imager, grid = scene(voxels=(5, 4), pitch=0.2, depths=(20.0,))
+    image = jnp.asarray(gaussian_filter(np.random.default_rng(0).random(imager.sensor.shape), 3))
+
+    def loss(v):
+        return jnp.sum(backproject(image, eqx.tree_at(lambda i: i.sensor_distance, imager, v), grid) ** 2)
+
+    check_grads(loss, (imager.sensor_distance,), order=2, modes=["fwd", "rev"], eps=1e-5, rtol=1e-4)
+
+
 def test_nothing_is_seen():
     """By lenses that are far away: no light, and gradients that are finite."""
     imager, grid = scene()

@@ -173,7 +173,7 @@ def unroll(
 
     def network_step(state, _):
         state, cost, _ = network.network_step(operator, light, state)
-        return state._replace(number=state.number + 1), cost
+        return state, cost
 
     return network.estimate(lax.scan(network_step, start, length=network.power.size)[0])
 

@@ -25,7 +25,7 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.replace("-", "_") for name in names)
 
 
-Names = Annotated[tuple[str, ...], Parsed("FIT_NAMES", _names)]
+Names = Annotated[tuple[str, ...], Parsed("names", _names)]
 
 
 @command("calibrate", "Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")

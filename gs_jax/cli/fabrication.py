@@ -119,9 +119,9 @@ def heights_command(design: DesignPath, *, output: Path, step_um: SmallUm = 10.0
     from ..io.provenance import sidecar
     from ..mold.heights import HEIGHT_SUFFIXES, write_heights
 
-    check_outputs(output, HEIGHT_SUFFIXES, sidecar(output), inputs=(design,), force=force)
     if output.suffix.lower() == ".csv" and given_options(["step_um"]):
         raise InputError(f"--step-um must be used with heights, got the list of lenses {output}.")
+    check_outputs(output, HEIGHT_SUFFIXES, sidecar(output), inputs=(design,), force=force)
     microscope = read_design(design)
     provenance = provenance_of(design, design=microscope)
     with Progress() as progress, errors_name_file(design):

@@ -47,7 +47,7 @@ from .recordings import RecordingOptions, SeriesRun, format_residual
 
 @dataclass
 class MethodOptions(OptionGroup):
-    """Options of methods, as `Plan.of` takes them.
+    """Options of methods, as `Plan.from_options` takes them.
 
     Options:
         method: Back-projection, or an iterative method.

@@ -123,7 +123,7 @@ _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "wa
 
 def current_name(name: str) -> str:
     """The name of a term that may be an earlier version's."""
-    return _RENAMED.get(name, name)
+    return name if name in TERMS else _RENAMED.get(name, name)
 
 
 def check_term(name: str) -> None:

@@ -199,7 +199,9 @@ def read_table(path: PathLike, header: str, max_rows: int) -> tuple[list[str], F
     _, names = next(table.rows, ("", []))
     if names[: len(expected)] != expected:
         raise input_error("header", header, short_repr(",".join(names)), path)
-    if (plain := _plain_numbers(text, len(names))) is not None and len(plain) <= max_rows:
+    # Commas are decimal where another character separates.
+    plain = _plain_numbers(text, len(names)) if table.separator == "," else None
+    if plain is not None and len(plain) <= max_rows:
         return names, plain
     rows = [table.numbers(line, names, cells) for line, cells in itertools.islice(table.rows, max_rows + 1)]
     if len(rows) > max_rows:
@@ -266,7 +268,7 @@ def _rows(path: PathLike, lines: Iterable[str], separator: str) -> Iterator[tupl
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
         for cells in reader:
-            if cells and cells != [""]:
+            if cells:
                 yield f"line {reader.line_num}", [cell.strip() for cell in cells]
     except csv.Error as error:
         raise InputError(f"{path}: line {reader.line_num} is not CSV: {error}.") from error
@@ -295,7 +297,7 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
     comment, lines = "", _text(path).splitlines()
     for line in itertools.takewhile(lambda line: line.lstrip()[:1] in ("", "#"), lines):
         comment = line.lstrip("# \t") if line.strip() else comment
-    table = _open_table(path, "\n".join("" if line.lstrip().startswith("#") else line for line in lines), blanks=True)
+    table = _open_table(path, "\n".join("" if line.lstrip()[:1] in ("", "#") else line for line in lines), blanks=True)
     line, first = next(table.rows, ("", []))
     if not first:
         raise InputError(f"{path}: no line; needs a header such as x_mm,y_mm, and a line for each lens.")

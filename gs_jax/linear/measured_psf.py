@@ -95,6 +95,7 @@ class ConvolutionOperator(Convolution):
         image_shape: tuple[int, int] | None = None,
         kept: Float[Array | np.ndarray, "row column"] | None = None,
     ):
+        psf_stack = jnp.asarray(native(psf_stack))
         if psf_stack.ndim != 3 or min(psf_stack.shape) < 1:
             raise InputError(f"psf_stack must be (depth, row, column) and not empty, got the shape {psf_stack.shape}.")
         self.image_shape = as_shape(image_shape or psf_stack.shape[1:])

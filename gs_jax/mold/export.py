@@ -31,6 +31,8 @@ from ..typing import PathLike
 from .lenslets import Part
 from .solids import MoldShape, alignment_marks, mold_bounds
 
+# Readers accept a few million facets of 50 bytes.
+MAX_MESH_BYTES = 2**31
 # Chordal tolerance of polygons where openings overlap, mm: below the resolution of photomasks.
 _MASK_CHORD = 1e-4
 # Unit and grid of GDSII files, m, and their last record, ENDLIB.
@@ -135,13 +137,21 @@ def check_mesh_reader(path: Path) -> None:
 def read_mesh(path: PathLike) -> Mesh:
     """Reads an STL or 3MF file, in mm, and merges equal vertices.
 
-    Raises `InputError` if the file cannot be read, has another format, or holds no facet.
+    Units that a 3MF declares are converted. Raises `InputError` if the file cannot be read, is too large, has another
+    format, or holds no facet.
     """
     path = check_input(path)
     check_suffix(path, MESH_SUFFIXES)
+    if path.stat().st_size > MAX_MESH_BYTES:
+        raise InputError(f"{path}: must have at most {MAX_MESH_BYTES} bytes, got {path.stat().st_size}.")
     check_mesh_reader(path)
     with decoding(path, "STL or 3MF file"):
-        corners = np.asarray(trimesh.load_mesh(path, process=False).triangles)
+        scene = trimesh.load_scene(path, process=False)
+        mesh = scene.to_mesh()
+        if scene.units not in (None, "mm", "millimeter", "millimeters"):
+            mesh.units = scene.units
+            mesh.convert_units("millimeters")
+        corners = np.asarray(mesh.triangles)
     if not len(corners) or not np.isfinite(corners).all():
         raise InputError(f"{path}: must hold facets with finite coordinates, got {len(corners)} facets.")
     return _merge_vertices(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))

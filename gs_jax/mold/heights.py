@@ -30,7 +30,7 @@ from ..design.design import Design
 from ..io.files import atomic_write, check_output, decoding, write_json
 from ..io.provenance import KEY, Provenance, sidecar
 from ..typing import PathLike
-from .lenslets import Lenslet, Part, surface_height
+from .lenslets import Part
 from .manufacturability import check_design, open_design, raise_first_error
 from .solids import MoldShape
 
@@ -338,16 +338,19 @@ def _check_lenses(path: Path, heights: HeightMap) -> Iterator[np.ndarray]:
     base = of(plate, "z_mm", "thickness_mm") @ (1, end)
     vertices = np.array([of(row, "z_mm", "thickness_mm") @ (1, end) for row in rows])
     yield sign * (vertices - base) - heights.part.height
-    lenslets = []
-    for row in rows:
-        terms = of(row, *(name for name in row if name.startswith("coefficient_")))
-        radius, conic, edge = of(row, f"radius_{face}_mm", f"conic_{face}", f"clear_semi_diameter_{face}_mm")
-        # The y of the list is against that of the part, except where the part is turned over.
-        center = of(row, "x_mm", "y_mm") * (1, -sign)
-        lenslets.append(Lenslet(center, edge, -sign * radius, conic, tuple(-sign * terms)))
+    # By the formula of the list's own numbers, not by the code that wrote them.
     for some, height, owner in heights.blocks():
-        points = np.stack(np.meshgrid(heights.x, heights.y[some]), -1).reshape(-1, 2)
-        values = surface_height(lenslets, points)[0].reshape(height.shape)
+        y, x = np.meshgrid(-sign * heights.y[some], heights.x, indexing="ij")
+        values = np.zeros(x.shape)
+        for row, vertex in zip(rows, vertices, strict=True):
+            radius, conic, edge = of(row, f"radius_{face}_mm", f"conic_{face}", f"clear_semi_diameter_{face}_mm")
+            squared = (x - float(row["x_mm"])) ** 2 + (y - float(row["y_mm"])) ** 2
+            inside = squared <= edge**2
+            c, r2 = 1 / radius, squared[inside]
+            z = vertex + c * r2 / (1 + np.sqrt(1 - (1 + conic) * c**2 * r2))
+            for order, term in enumerate(of(row, *(name for name in row if name.startswith("coefficient_"))), 2):
+                z = z + term * r2**order
+            values[inside] = np.maximum(values[inside], sign * (z - base))
         yield np.where((owner >= 0) | (height == 0), values - height, 0)
 
 

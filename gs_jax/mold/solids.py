@@ -285,7 +285,11 @@ def mold_volume(part: Part, shape: MoldShape) -> float:
     block = math.prod(np.diff(mold_bounds(part, shape), axis=0)[0])
     tools = engraving_tools(part, shape)
     engraved = sum(tool.trim_by_plane([0, 0, -1], -shape.headroom).volume() for tool in tools)
-    opening = _opening(part, shape, shape.headroom).volume()
+    # In closed form, not by the solid that is subtracted: a prismatoid, which widens by the draft.
+    depth = part.plate_thickness * shape.scale + shape.headroom
+    flare = depth * math.tan(shape.draft)
+    areas = [math.prod(side * shape.scale + wider for side in part.size) for wider in (0.0, flare, 2 * flare)]
+    opening = depth * (areas[0] + 4 * areas[1] + areas[2]) / 6
     return block - shape.scale**3 * lenslets_volume(part) - opening - engraved
 
 

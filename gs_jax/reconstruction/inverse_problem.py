@@ -179,11 +179,13 @@ class InverseProblem(eqx.Module):
 
     def project(self, volume: Float[Array | np.ndarray, "depth y x"], exact: Any) -> Float[Array, "row column"]:
         """The image of a volume; if `exact`, which may be traced, without the modes that least squares leave out."""
+        exact = exact if self.back_projections else True
         image = self.imaging.mv(volume)
         return self.keep(jnp.where(exact, self.detrend(image), image))
 
     def project_back(self, image: Float[Array | np.ndarray, "row column"], exact: Any) -> Float[Array, "depth y x"]:
-        """The volume of an image by back-projection; if `exact`, by the adjoint of `project`."""
+        """The volume of an image by back-projection; if `exact`, or without back-projections, by the adjoint."""
+        exact = exact if self.back_projections else True
         image = self.keep(image)
 
         def adjoint() -> Any:

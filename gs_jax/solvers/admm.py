@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
+from ..linear.measured_psf import ConvolutionOperator
 from ..typing import Image, Real
 from .base import (
     Operator,
@@ -294,6 +295,10 @@ class ConvolutionState(NamedTuple):
     cost: Array
 
 
+def _as_weight(weight):
+    return 0.0 if weight is None else weight
+
+
 class ConvolutionADMM(eqx.Module):
     """ADMM for a `ConvolutionOperator`, with 3-D total variation and an L1 penalty.
 
@@ -345,14 +350,14 @@ class ConvolutionADMM(eqx.Module):
     sparsity: Real | Float[Array, ""] = 0.01
     tv: Real | Float[Array, ""] = 0.0
     isotropic: bool = eqx.field(static=True, default=False)
-    tv_z: Real | Float[Array, ""] = 1.0
+    tv_z: Real | Float[Array, ""] = eqx.field(converter=_as_weight, default=1.0)
     nonnegative: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
         check_options(self)
 
     def init(self, A: Any, image: Image) -> ConvolutionState:
-        if not hasattr(A, "spectra"):
+        if not isinstance(A, ConvolutionOperator):
             raise InputError(f"ConvolutionADMM() must be used with a ConvolutionOperator, got {type(A).__name__}.")
         image = as_image(A, image)
         weights = _weights(self, A.T.mv(image))

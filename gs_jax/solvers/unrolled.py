@@ -166,8 +166,9 @@ class Unrolled(eqx.Module):
     def network_step(
         self, A: Operator, image: Float[Array, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
-        """Take a step with a network, for training: `step` would keep what gradients of its other kinds need."""
-        return self._advance(A, image, state, kind=_NETWORK)
+        """`step` of the kind with a network alone, for training: gradients of `step` would hold arrays of all kinds."""
+        state, cost, change = self._advance(A, image, state, kind=_NETWORK)
+        return state._replace(number=state.number + 1), cost, change
 
     def _advance(self, A, light, state, *, kind):
         """Take a step of some kind, traced or not, with one image of a volume and one volume of an image."""
