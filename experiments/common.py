@@ -24,6 +24,7 @@ from rich.table import Table
 from skimage.feature import peak_local_max
 
 from gs_jax import Design, Grid, Imager, InputError, Progress, Sensor, geomscope, read_design
+from gs_jax.apps.benchmark import markdown_table
 from gs_jax.apps.pictures import PALETTE
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.lenses import EACH
@@ -100,6 +101,40 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]], title: str | No
     for row in rows:
         lines.add_row(*row)
     return lines
+
+
+def tables_report(
+    name: str,
+    numbers: Any,
+    *tables: tuple[Sequence[str], Sequence[Sequence[str]]],
+    title: str = "",
+    text: str = "",
+    **pictures: Figure,
+) -> Report:
+    """Report tables of columns and rows on the terminal and in `NAME.md`, numbers in `NAME.json`, and `NAME.png`."""
+    parts = [f"# {title}" if title else "", *(markdown_table(*part) for part in tables), text]
+    files = {f"{name}.json": numbers, f"{name}.md": "\n\n".join(filter(None, parts)) + "\n"}
+    files |= {f"{name}.{suffix}": figure for suffix, figure in pictures.items()}
+    return Report(files, [*(table(*part) for part in tables), *filter(None, [text])])
+
+
+def names_of(allowed: Collection[str]) -> Callable[[str], list[str]]:
+    """Type of an option that takes some of these names, separated by commas."""
+
+    def names(text: str) -> list[str]:
+        given = [name.strip() for name in text.split(",")]
+        if unknown := [name for name in given if name not in allowed]:
+            raise argparse.ArgumentTypeError(f"must be of {', '.join(allowed)}, got {', '.join(unknown)}.")
+        return given
+
+    return names
+
+
+def half_light_radius(distances: np.ndarray, light: np.ndarray) -> float:
+    """Radius that encloses half of the light, which is given at these distances from the middle."""
+    order = np.argsort(distances)
+    enclosed = np.cumsum(light[order])
+    return float(np.interp(enclosed[-1] / 2, enclosed, distances[order]))
 
 
 def design_file(name: str) -> Path:

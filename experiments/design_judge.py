@@ -32,10 +32,9 @@ import jax
 import numpy as np
 
 import gs_jax as gs
-from experiments.common import Report, cropped, design_file, designs_by_name, main, read_records, table
+from experiments.common import Report, cropped, design_file, designs_by_name, main, read_records, tables_report
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
@@ -382,14 +381,12 @@ def report(
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
     by_design = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
-    columns, rows = rows_of(by_design, settings)
     of_model = ("design", *(f"{kind}, error of the model" for kind in IN_PLANES))
     errors = [
         [name, *(f"{model_error(imager, kind, settings):.3f}" for kind in IN_PLANES)]
         for name, imager in progress.track(list(imagers.items()), "Images of the model")
     ]
-    text = "\n\n".join((markdown_table(columns, rows), markdown_table(of_model, errors)))
-    return Report({"design_judge.md": text}, [table(columns, rows), table(of_model, errors)])
+    return tables_report("design_judge", by_design, rows_of(by_design, settings), (of_model, errors))
 
 
 if __name__ == "__main__":

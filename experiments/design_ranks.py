@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.stats import rankdata
 
-from experiments.common import Report, design_file, designs_by_name, main, read_records, table
+from experiments.common import Report, design_file, designs_by_name, main, read_records, tables_report
 from experiments.design_judge import (
     DESIGNS,
     IMAGES,
@@ -40,7 +40,6 @@ from experiments.design_judge import (
 )
 from experiments.ray_tracer import bundles
 from gs_jax import Design, Imager, Progress, geomscope, quality, random_layout, rasterize, read_design
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.codesign.terms import TERMS
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.layouts import hexagonal_layout
@@ -243,12 +242,8 @@ def shown(by_name: dict[str, Any], named: dict[str, Any]) -> Report:
     rows += [[f"`{name}`", *both(judge, values[name])] for name in names]
     columns = ("objective", f"all {len(judge)} designs", "the better half")
     means = [[name, f"{psnr:.1f}"] for name, psnr in zip(named, mean_psnr(named).mean(1), strict=True)]
-    tables = ((columns, rows), (("design", "the judge's mean PSNR, dB"), means))
-    files = {
-        "design_ranks.md": "\n\n".join(markdown_table(*columns_and_rows) for columns_and_rows in tables),
-        "design_ranks.json": by_name,
-    }
-    return Report(files, [table(*columns_and_rows) for columns_and_rows in tables])
+    of_named = ("design", "the judge's mean PSNR, dB"), means
+    return tables_report("design_ranks", by_name, (columns, rows), of_named)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ DATA holds `P1.toml`, `P1_h.tif`, `P1_f.tif` and their scenes `h.json`, `f.json`
 only the simulated captures are used.
 """
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,9 +23,9 @@ from rich.json import JSON
 from scipy.ndimage import gaussian_filter
 
 import gs_jax as gs
+from experiments import true_image
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.phantoms import snowflake
-from experiments.true_image import bars, strokes
 from gs_jax.apps.example_pipeline import words
 from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.unet import pretrained
@@ -55,12 +54,9 @@ def run(design: gs.Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, pro
     grid = gs.Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
     captures = {name: _simulated(emitters, design, progress) for name, emitters in simulated_scenes().items()}
     if data:
-        words_of = json.loads((data / "h.json").read_text())["planes"]
-        elements = json.loads((data / "f.json").read_text())["elements"]
-        emitters = {"h": np.concatenate([strokes(word) for word in words_of]), "f": bars(elements)}
-        for name, scene in (("letters", "h"), ("USAF target", "f")):
+        for name, scene, emitters_of in (("letters", "h", true_image.words), ("USAF target", "f", true_image.target)):
             image = gs.read_capture(data / f"P1_{scene}.tif", imager.sensor.shape)
-            captures[f"{name}, ray-traced"] = image, emitters[scene]
+            captures[f"{name}, ray-traced"] = image, emitters_of(data / f"{scene}.json")
     scenes = {}
     for name, (counts, emitters) in captures.items():
         truth = gaussian_filter(np.asarray(gs.rasterize(emitters, grid), np.float32), (0, 1, 1))

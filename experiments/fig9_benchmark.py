@@ -18,7 +18,6 @@ because the voxels are coarse. FILE is the output of `gs-jax train --network unr
 weights. Writes `captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -29,11 +28,11 @@ from jaxtyping import Float32, Num
 from matplotlib.figure import Figure
 
 import gs_jax as gs
-from experiments.common import Report, local_maxima, main, points_of
+from experiments.common import Report, local_maxima, main, names_of, points_of, tables_report
 from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
-from experiments.true_image import DEVICES, bars, strokes
-from gs_jax.apps.benchmark import markdown_table, render_points, timed
+from experiments.true_image import DEVICES, target, words
+from gs_jax.apps.benchmark import render_points, timed
 from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.unet import pretrained
@@ -81,13 +80,11 @@ def _points(data: Path) -> Scene:
 
 
 def _letters(data: Path) -> Scene:
-    words = json.loads((data / "h.json").read_text())["planes"]
-    return _captured(data, "h", np.arange(18.0, 22.01, 0.5), np.concatenate([strokes(word) for word in words]))
+    return _captured(data, "h", np.arange(18.0, 22.01, 0.5), words(data / "h.json"))
 
 
 def _target(data: Path) -> Scene:
-    elements = json.loads((data / "f.json").read_text())["elements"]
-    return _captured(data, "f", np.arange(17.0, 20.01, 0.5), bars(elements))
+    return _captured(data, "f", np.arange(17.0, 20.01, 0.5), target(data / "f.json"))
 
 
 def _snowflake(data: Path) -> Scene:
@@ -98,8 +95,8 @@ def _snowflake(data: Path) -> Scene:
 def _other_lenses(data: Path) -> Scene:
     device = DEVICES["R = 1.6"]
     places = zip("HTL", (12.5, 14.0, 15.5), ((-3.0, -2.4), (0.0, 2.4), (3.0, -1.2)), strict=True)
-    words = [letters(a, depth=z, height=2.4, pitch=0.02) + np.array([*xy, 0, 0]) for a, z, xy in places]
-    return _traced(device.imager(), np.arange(12.5, 15.51, 0.5), np.concatenate(words))
+    emitters = [letters(a, depth=z, height=2.4, pitch=0.02) + np.array([*xy, 0, 0]) for a, z, xy in places]
+    return _traced(device.imager(), np.arange(12.5, 15.51, 0.5), np.concatenate(emitters))
 
 
 SCENES: dict[str, Callable[[Path], Scene]] = {
@@ -182,12 +179,13 @@ def run(
     return {"rows": rows}, pictures
 
 
-def markdown(results: dict) -> str:
+def rows_of(results: dict) -> tuple[tuple[str, ...], list[list[str]]]:
+    """Columns and rows of the table."""
     head = ("scene", "method", "s, with compilation", "PSNR, dB", "SSIM", "MSE", "F1", "imaged again")
     pretty = lambda value, form: "-" if value is None else format(value, form)
     forms = {"seconds": ".1f", "psnr_db": ".2f", "ssim": ".3f", "mse": ".2e", "f1": ".2f", "reprojection": ".3f"}
     rows = [[r["scene"], r["method"], *(pretty(r[key], form) for key, form in forms.items())] for r in results["rows"]]
-    return markdown_table(head, rows) + "\n"
+    return head, rows
 
 
 def picture(pictures: dict[tuple[str, str], View]) -> Figure:
@@ -209,16 +207,12 @@ def picture(pictures: dict[tuple[str, str], View]) -> Figure:
     return figure
 
 
-def report(data: Path, scenes: str, weights: Path | None, progress: gs.Progress) -> Report:
-    names = scenes.split(",")
-    if unknown := [name for name in names if name not in SCENES]:
-        raise gs.InputError(f"--scenes: found {', '.join(unknown)}, allowed: {', '.join(SCENES)}.")
+def report(data: Path, scenes: list[str], weights: Path | None, progress: gs.Progress) -> Report:
     networks = read_unrolled(weights) if weights else gs.Unrolled.pretrained()
-    results, pictures = run(data, networks, names, progress=progress)
-    text = markdown(results)
-    return Report({"captures.json": results, "captures.md": text, "captures.png": picture(pictures)}, [text])
+    results, pictures = run(data, networks, scenes, progress=progress)
+    return tables_report("captures", results, rows_of(results), png=picture(pictures))
 
 
 if __name__ == "__main__":
-    arguments = {"data": {"type": Path}, "--scenes": {"default": ",".join(SCENES)}, "--weights": {"type": Path}}
-    main(report, arguments, folder="fig9")
+    scenes = {"type": names_of(SCENES), "default": list(SCENES)}
+    main(report, {"data": {"type": Path}, "--scenes": scenes, "--weights": {"type": Path}}, folder="fig9")

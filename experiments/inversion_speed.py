@@ -21,8 +21,7 @@ import numpy as np
 
 import gs_jax as gs
 from experiments.backprojection_speed import in_new_process
-from experiments.common import Report, main, table
-from gs_jax.apps.benchmark import markdown_table
+from experiments.common import Report, main, names_of, tables_report
 from gs_jax.base.machine import status_mib
 from gs_jax.reconstruction.inverse_problem import prepare_model
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
@@ -127,17 +126,14 @@ def run(names: list[str], pixels: int, progress: gs.Progress) -> dict[str, dict[
     return results
 
 
-def report(methods: str, pixels: int, progress: gs.Progress) -> Report:
-    names = methods.split(",")
-    if unknown := [name for name in names if name not in NAMES]:
-        raise gs.InputError(f"--methods must be of {', '.join(NAMES)}, got {', '.join(unknown)}.")
-    results = run(names, pixels, progress)
+def report(methods: list[str], pixels: int, progress: gs.Progress) -> Report:
+    results = run(methods, pixels, progress)
     cell = lambda row, key: format(row[key], COLUMNS[key][1]) if key in row else ""
     rows = [[name, *(cell(row, key) for key in COLUMNS)] for name, row in results.items()]
     columns = ("", *(title for title, _ in COLUMNS.values()))
-    files = {"inversion_speed.json": results, "inversion_speed.md": markdown_table(columns, rows)}
-    return Report(files, [table(columns, rows)])
+    return tables_report("inversion_speed", results, (columns, rows))
 
 
 if __name__ == "__main__":
-    main(report, {"--methods": {"default": ",".join(NAMES)}, "--pixels": {"type": int, "default": 5120}})
+    methods = {"type": names_of(NAMES), "default": NAMES}
+    main(report, {"--methods": methods, "--pixels": {"type": int, "default": 5120}})

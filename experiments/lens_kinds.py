@@ -18,10 +18,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter
 
-from experiments.common import Report, main, table
+from experiments.common import Report, half_light_radius, main, tables_report
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Progress, read_design, read_study
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.codesign.parameters import new_design
 from gs_jax.codesign.pareto import sweep_of, trade_off
 from gs_jax.codesign.study import Study
@@ -76,9 +75,7 @@ def core_by_diffraction(design: Design, depth: float) -> float:
     psf = np.asarray(diffraction_psf(imager, depth, size=size, radius=radius, samples=6))
     row, column = np.unravel_index(int(psf.argmax()), psf.shape)
     y, x = np.indices(psf.shape)
-    away = np.hypot(y - row, x - column).ravel()
-    order = np.argsort(away)
-    half = np.interp(0.5, np.cumsum(psf.ravel()[order]), away[order])
+    half = half_light_radius(np.hypot(y - row, x - column).ravel(), psf.ravel())
     return 2000 * half * imager.sensor.pixel_pitch / float(imager.magnification(depth))
 
 
@@ -135,9 +132,10 @@ def report(progress: Progress) -> Report:
             numbers += (lens.aperture_diameter_mm, lens.conic_constant, record["width_um"])
             numbers += (max(record["optiland_width_um"]), max(record["half_light_um"]))
             rows.append([kind, *(f"{number:.3g}" for number in numbers)])
-    files: dict[str, Any] = {"lens_kinds.md": markdown_table(columns, rows), "lens_kinds.png": curves(results)}
-    plain = {kind: [{**row, "design": design_text(row["design"])} for row in rows] for kind, rows in results.items()}
-    return Report(files | {"lens_kinds.json": plain}, [table(columns, rows)])
+    plain = {
+        kind: [{**row, "design": design_text(row["design"])} for row in records] for kind, records in results.items()
+    }
+    return tables_report("lens_kinds", plain, (columns, rows), png=curves(results))
 
 
 if __name__ == "__main__":

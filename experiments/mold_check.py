@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common import Report, main, table
+from experiments.common import Report, main, tables_report
 from gs_jax import Design, Imager, Progress, geomscope, read_design
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
 from gs_jax.mold.lenslets import Part
 from gs_jax.mold.measurement import measure_lenslets, summarize
@@ -107,9 +106,7 @@ def report(progress: Progress) -> Report:
         measure(differing(design.imager()), chord_um) for chord_um in progress.track((0.5, 2.0), "Unequal lenses")
     ]
     titles, lines, unequal = [title for title, _ in COLUMNS.values()], rows(records), rows(others)
-    text = "\n\n".join(markdown_table(titles, part) for part in (lines, unequal)) + "\n"
-    data = {"mold.json": {"alike": records, "unequal": others}, "mold.md": text}
-    return Report(data, [table(titles, lines), table(titles, unequal)])
+    return tables_report("mold", {"alike": records, "unequal": others}, (titles, lines), (titles, unequal))
 
 
 if __name__ == "__main__":

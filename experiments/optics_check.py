@@ -30,7 +30,7 @@ from rich.json import JSON
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of, table
+from experiments.common import OPTIONAL_PATH, Report, design_of, half_light_radius, main, points_of, table
 from experiments.ray_tracer import traced
 from gs_jax import Design, Imager, MicrolensArray, Progress, Sensor, read_capture, read_design
 from gs_jax.calibration.spots import find_spots
@@ -251,12 +251,14 @@ def _measures(image, offset: np.ndarray) -> dict:
     grid = np.indices(image.shape) - image.shape[0] // 2
     centroid = (grid * image).sum((1, 2))
     radii = np.hypot(*(grid - centroid[:, None, None])).ravel()
-    order = np.argsort(radii)
-    half_light = np.interp(0.5, np.cumsum(image.ravel()[order]), radii[order])
     peak = np.unravel_index(np.argmax(image), image.shape)
     core = np.abs(grid - grid[(slice(None), *peak)][:, None, None]).max(0) <= 2
     middle = (grid * image * core).sum((1, 2)) / (image * core).sum()
-    return {"centroid_px": centroid - offset, "core_px": middle - offset, "half_light_px": half_light}
+    return {
+        "centroid_px": centroid - offset,
+        "core_px": middle - offset,
+        "half_light_px": half_light_radius(radii, image.ravel()),
+    }
 
 
 def summary(rows: list[dict]) -> dict:

@@ -24,9 +24,8 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from experiments.common import Report, main, table
+from experiments.common import Report, main, tables_report
 from gs_jax import Progress
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.base.machine import describe
 
 # Planes of the stack that the example takes, the weights of its priors, and the steps of each code.
@@ -146,10 +145,8 @@ def report(data: Path, scico: str | None, lensless: str | None, rounds: int, pro
     }
     cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in row.values()] for row in of_volume]
     steps = [step_cells(pixels, row) for pixels, rows in of_plane.items() for row in rows]
-    tables = ((VOLUME_COLUMNS, cells), (STEP_COLUMNS, steps))
-    text = "\n\n".join(markdown_table(*columns_and_rows) for columns_and_rows in tables)
     numbers = {"machine": describe(), "volume": of_volume, "plane": of_plane}
-    return Report({"peers.json": numbers, "peers.md": text}, [table(*columns_and_rows) for columns_and_rows in tables])
+    return tables_report("peers", numbers, (VOLUME_COLUMNS, cells), (STEP_COLUMNS, steps))
 
 
 if __name__ == "__main__":

@@ -61,35 +61,18 @@ class Problem:
 Run = Iterator[tuple[Callable[[], np.ndarray], float]]
 
 
-def gs_jax(problem: Problem) -> Callable[[], Run]:
+def gs_jax(problem: Problem, method: str = "ADMM") -> Callable[[], Run]:
     import jax
 
-    from gs_jax import ConvolutionADMM, ConvolutionOperator
+    from gs_jax import FISTA, ConvolutionADMM, ConvolutionOperator, RichardsonLucy
 
     A = ConvolutionOperator(problem.stack, problem.image.shape)
-    unit = float(jax.jit(lambda A, y: A.T.mv(y).max())(A, problem.image))
-    weights = {"tv": problem.tv / unit, "sparsity": problem.l1 / unit, "tv_z": 0.0}
-    return _ours(problem, ConvolutionADMM(1, isotropic=problem.isotropic, nonnegative=not problem.signed, **weights))
-
-
-def gs_jax_fista(problem: Problem) -> Callable[[], Run]:
-    from gs_jax import FISTA
-
-    return _ours(problem, FISTA(1, sparsity=0.0))
-
-
-def gs_jax_richardson_lucy(problem: Problem) -> Callable[[], Run]:
-    from gs_jax import RichardsonLucy
-
-    return _ours(problem, RichardsonLucy(1))
-
-
-def _ours(problem: Problem, solver: Any) -> Callable[[], Run]:
-    import jax
-
-    from gs_jax import ConvolutionOperator
-
-    A = ConvolutionOperator(problem.stack, problem.image.shape)
+    if method == "ADMM":
+        unit = float(jax.jit(lambda A, y: A.T.mv(y).max())(A, problem.image))
+        weights = {"tv": problem.tv / unit, "sparsity": problem.l1 / unit, "tv_z": 0.0}
+        solver = ConvolutionADMM(1, isotropic=problem.isotropic, nonnegative=not problem.signed, **weights)
+    else:
+        solver = FISTA(1, sparsity=0.0) if method == "FISTA" else RichardsonLucy(1)
     init, step = jax.jit(solver.init), jax.jit(solver.step, donate_argnums=2)
 
     def start() -> Run:
@@ -178,30 +161,20 @@ def _of_sign(scene, signed: bool) -> np.ndarray:
     return np.asarray(scene) if signed else np.maximum(np.asarray(scene), 0)
 
 
-def LenslessPiCam(problem: Problem) -> Callable[[], Run]:
-    from lensless import ADMM  # pyright: ignore[reportMissingImports]
+def LenslessPiCam(problem: Problem, method: str = "ADMM") -> Callable[[], Run]:
+    """The scene of FISTA ends where the image does."""
+    from lensless import ADMM, FISTA  # pyright: ignore[reportMissingImports]
 
     def start() -> Run:
-        solver = ADMM(problem.stack[..., None].astype(np.float32))
+        psf, is_admm = problem.stack[..., None].astype(np.float32), method == "ADMM"
+        solver = ADMM(psf) if is_admm else FISTA(psf, norm="backward", initial_est=np.zeros_like(psf[None]))
         solver.set_data(problem.image[None, None, :, :, None].astype(np.float32))
         for number in count():
             solver._update(number)
-            yield partial(_of_sign, solver._image_est[0, ..., 0], problem.signed), math.nan
-
-    return start
-
-
-def LenslessPiCam_fista(problem: Problem) -> Callable[[], Run]:
-    """Of a scene that ends where the image does."""
-    from lensless import FISTA  # pyright: ignore[reportMissingImports]
-
-    def start() -> Run:
-        psf = problem.stack[..., None].astype(np.float32)
-        solver = FISTA(psf, norm="backward", initial_est=np.zeros_like(psf[None]))
-        solver.set_data(problem.image[None, None, :, :, None].astype(np.float32))
-        for number in count():
-            solver._update(number)
-            yield partial(_within, solver._xk, problem), math.nan
+            if is_admm:
+                yield partial(_of_sign, solver._image_est[0, ..., 0], problem.signed), math.nan
+            else:
+                yield partial(_within, solver._xk, problem), math.nan
 
     return start
 
@@ -217,12 +190,12 @@ def _within(scene, problem: Problem) -> np.ndarray:
 CODES: dict[str, Callable[[Problem], Callable[[], Run]]] = {
     **{code.__name__: code for code in (gs_jax, scico, LenslessPiCam)},
     "gs_jax ADMM": gs_jax,
-    "gs_jax FISTA": gs_jax_fista,
-    "gs_jax Richardson-Lucy": gs_jax_richardson_lucy,
+    "gs_jax FISTA": partial(gs_jax, method="FISTA"),
+    "gs_jax Richardson-Lucy": partial(gs_jax, method="Richardson-Lucy"),
     "scico ADMM": partial(scico, prints=False),
     "scico FISTA": scico_fista,
     "LenslessPiCam ADMM": LenslessPiCam,
-    "LenslessPiCam FISTA": LenslessPiCam_fista,
+    "LenslessPiCam FISTA": partial(LenslessPiCam, method="FISTA"),
 }
 # Packages whose versions are written, by the code.
 PACKAGES = {"gs_jax": ("gs-jax", "jax"), "scico": ("scico", "jax"), "LenslessPiCam": ("lensless", "scipy")}

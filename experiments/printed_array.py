@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy.optimize import least_squares
 
-from experiments.common import Report, main, table
+from experiments.common import Report, half_light_radius, main, table
 from gs_jax import Imager, MicrolensArray, Progress, Sensor, calibrate, read_capture
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
@@ -85,10 +85,7 @@ def ray_widths(imager: Imager, depth: float) -> np.ndarray:
     for which, lens in zip(types, split_by_type(imager, types), strict=True):
         aperture = aperture_profile(lens.array)
         rays = add_diffraction(lens, sample_pupil(lens, depth, np.zeros(1), aperture, RAYS), aperture)
-        distance = np.hypot(*rays.landing[0].T)
-        order = np.argsort(distance)
-        light = np.cumsum(rays.light[0][order])
-        widths[list(which)] = np.interp(light[-1] / 2, light, distance[order])
+        widths[list(which)] = half_light_radius(np.hypot(*rays.landing[0].T), rays.light[0])
     return widths
 
 

@@ -17,7 +17,6 @@ Writes `surfaces.md`, `surfaces.json` and `surfaces.png`; about twenty minutes o
 """
 
 import time
-from pathlib import Path
 
 import equinox as eqx
 import numpy as np
@@ -25,11 +24,10 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from experiments.common import Report, cropped, main, table
+from experiments.common import Report, cropped, design_file, main, names_of, tables_report
 from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
-from gs_jax import Grid, Imager, InputError, Progress, Reconstructor, Sensor, Surface, quality, rasterize, read_design
-from gs_jax.apps.benchmark import markdown_table
+from gs_jax import Grid, Imager, Progress, Reconstructor, Sensor, Surface, quality, rasterize, read_design
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.surface_fit import fit_sheets
 
@@ -42,6 +40,7 @@ RAYS, TILE, APART = 1000, 0.1, 0.02
 
 # Scenes with one depth in each column.
 SHEETS = ("tilted snowflake", "curved leaf", "hemisphere")
+SCENES = (*SHEETS, "two sheets", "blobs")
 
 # Heading, factor and digits of each number.
 COLUMNS = {
@@ -62,11 +61,7 @@ Emitters = Float[np.ndarray, "emitter 4"]
 
 def device(design: str, pixels: int = PIXELS) -> Imager:
     """The lenses of a design about the middle, and a sensor there."""
-    imager = cropped(
-        read_design(Path(__file__).parents[1] / "design" / f"{design}.toml").imager(),
-        pixels,
-        reach=pixels * PITCH / 2 + 2.0,
-    )
+    imager = cropped(read_design(design_file(design)).imager(), pixels, reach=pixels * PITCH / 2 + 2.0)
     return eqx.tree_at(lambda i: i.sensor, imager, Sensor((pixels, pixels), PITCH))
 
 
@@ -224,32 +219,25 @@ def picture(results: list[dict]) -> Figure:
     return figure
 
 
-def report(design: str, scenes: str, progress: Progress) -> Report:
+def report(design: str, scenes: list[str], progress: Progress) -> Report:
     imager, all_scenes = device(design), make_scenes(PIXELS * PITCH)
-    names = [name.strip() for name in scenes.split(",")] if scenes else list(all_scenes)
-    if unknown := next((name for name in names if name not in all_scenes), ""):
-        raise InputError(f"--scenes must be of {', '.join(all_scenes)}, got {unknown}.")
     methods, results = Methods(imager, progress), []
-    for name in names:
+    for name in scenes:
         emitters = all_scenes[name]
         clean = capture(emitters, imager)
         for electrons in ELECTRONS if name in SHEETS else ELECTRONS[:1]:
-            image, free = noisy(clean, electrons), name == names[0]
+            image, free = noisy(clean, electrons), name == scenes[0]
             results.append({"electrons": electrons} | run(image, name, emitters, methods, free, progress))
     slower = [r["time_over_unrolled"] for r in results if "time_over_unrolled" in r][-1]
     columns = ("scene", "electrons", *(title for title, _, _ in COLUMNS.values()), "warned")
     cell = lambda value, factor, digits: "" if value is None else f"{factor * value:.{digits}f}"
-    numbers = lambda r: (cell(r.get(key), *form) for key, (_, *form) in COLUMNS.items())
-    rows = [[r["scene"], str(r["electrons"]), *numbers(r), "yes" if r["warning"] else "no"] for r in results]
+    cells = lambda r: (cell(r.get(key), *form) for key, (_, *form) in COLUMNS.items())
+    rows = [[r["scene"], str(r["electrons"]), *cells(r), "yes" if r["warning"] else "no"] for r in results]
     took = f"A fit takes {slower:.1f} times the processor time of the unrolled inversion."
-    text = f"# Sheets in ray-traced captures by {design}\n\n{markdown_table(columns, rows)}\n\n{took}\n"
     kept = [{key: value for key, value in r.items() if key != "maps"} for r in results]
-    everything = {"scenes": kept, "time_over_unrolled": slower}
-    return Report(
-        {"surfaces.json": everything, "surfaces.md": text, "surfaces.png": picture(results)},
-        [table(columns, rows), took],
-    )
+    numbers, title = {"scenes": kept, "time_over_unrolled": slower}, f"Sheets in ray-traced captures by {design}"
+    return tables_report("surfaces", numbers, (columns, rows), title=title, text=took, png=picture(results))
 
 
 if __name__ == "__main__":
-    main(report, {"--design": {"default": "geomscope"}, "--scenes": {"default": ""}})
+    main(report, {"--design": {"default": "geomscope"}, "--scenes": {"type": names_of(SCENES), "default": SCENES}})

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.optimize import root_scalar
 from scipy.spatial import KDTree
 
-from experiments.common import Report, main, table
+from experiments.common import Report, main, tables_report
 from gs_jax import Design, Progress, geomscope, objectives
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.design.datasheets import datasheet
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
@@ -155,17 +154,11 @@ def _counted(design: Design) -> str:
     return f"{counts.min()}-{counts.max()}, mean {counts.mean():.1f}"
 
 
-def markdown(results: dict[str, list[dict[str, str]]]) -> str:
-    """Both tables in Markdown."""
-    made = (markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in results.values())
-    return "\n\n".join(made) + "\n"
-
-
 def report(progress: Progress) -> Report:
     with progress.step("Datasheets"):
         results = run()
-    shown = [table(rows[0], [row.values() for row in rows]) for rows in results.values()]
-    return Report({"table1.json": results, "table1.md": markdown(results)}, shown)
+    tables = ((list(rows[0]), [list(row.values()) for row in rows]) for rows in results.values())
+    return tables_report("table1", results, *tables)
 
 
 if __name__ == "__main__":

@@ -21,9 +21,8 @@ from pathlib import Path
 import numpy as np
 
 import gs_jax as gs
-from experiments.common import Report, main, table
-from experiments.true_image import BLACK, GAIN, scores, strokes
-from gs_jax.apps.benchmark import markdown_table
+from experiments.common import Report, main, names_of, tables_report
+from experiments.true_image import electrons, scores, words as emitters_of_words
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 
@@ -96,9 +95,8 @@ def on_points(data: Path, devices: dict[str, gs.Imager], progress: gs.Progress) 
 
 def on_words(data: Path, devices: dict[str, gs.Imager], methods: list[str], progress: gs.Progress) -> dict:
     """Each device's image of the words, and the volumes of some methods."""
-    truth = json.loads((data / "L_words.json").read_text())
     image = gs.read_capture(data / "L_words.tif", devices[CASES[0]].sensor.shape)
-    emitters = np.concatenate([strokes(plane) for plane in truth["planes"]])
+    emitters = emitters_of_words(data / "L_words.json")
     z = np.unique(emitters[:, 2])
     count = 2 * int(np.ceil(np.abs(emitters[:, :2]).max() / _FINE + 1)) + 1
     fine = gs.Grid(z, (count, count), _FINE)
@@ -116,14 +114,10 @@ def on_words(data: Path, devices: dict[str, gs.Imager], methods: list[str], prog
     return results
 
 
-def electrons(image: np.ndarray) -> np.ndarray:
-    return GAIN * (image.astype(np.float64) - BLACK)
-
-
-def report(data: Path, methods: str, progress: gs.Progress) -> Report:
+def report(data: Path, methods: list[str], progress: gs.Progress) -> Report:
     devices, fits = calibrated(data, progress)
     points = on_points(data, devices, progress)
-    words = on_words(data, devices, methods.split(","), progress)
+    words = on_words(data, devices, methods, progress)
     cases, columns = CASES, ("", *CASES)
     row = lambda label, values: [label, *values]
     rows = [
@@ -137,13 +131,10 @@ def report(data: Path, methods: str, progress: gs.Progress) -> Report:
         row("axial spread about the bias, um", [f"{points[case]['axial_spread_um']:.0f}" for case in cases]),
         row("words, model: correlation, binned 4", [f"{_model(words, case, 'bin_4'):.3f}" for case in cases]),
         row("words, model: light", [f"{words[case]['model']['light']:.3f}" for case in cases]),
-        *(row(f"words, {m}: dB above empty", [f"{words[c][m]:.1f}" for c in cases]) for m in methods.split(",")),
+        *(row(f"words, {m}: dB above empty", [f"{words[c][m]:.1f}" for c in cases]) for m in methods),
     ]
-    text = "# Captures through layers\n\n" + markdown_table(columns, rows) + "\n"
-    return Report(
-        {"layers.json": {"calibration": fits, "points": points, "words": words}, "layers.md": text},
-        [table(columns, rows)],
-    )
+    numbers = {"calibration": fits, "points": points, "words": words}
+    return tables_report("layers", numbers, (columns, rows), title="Captures through layers")
 
 
 def _with_error(fit: dict, name: str) -> str:
@@ -155,4 +146,5 @@ def _model(words: dict, case: str, binned: str) -> float:
 
 
 if __name__ == "__main__":
-    main(report, {"data": {"type": Path}, "--methods": {"default": "backproject,richardson-lucy,unrolled"}})
+    methods = {"type": names_of(METHODS), "default": ["backproject", "richardson-lucy", "unrolled"]}
+    main(report, {"data": {"type": Path}, "--methods": methods})

@@ -27,9 +27,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import gs_jax as gs
-from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
+from experiments.common import OPTIONAL_PATH, Report, main, points_of, tables_report
 from experiments.ray_tracer import traced
-from gs_jax.apps.benchmark import markdown_table
 from gs_jax.geometry import envelope
 from gs_jax.lenses import Orientation
 from gs_jax.optics.aberrations import best_focus
@@ -120,17 +119,30 @@ def of_points(points: np.ndarray, imager: gs.Imager, image: np.ndarray, progress
 def on_captures(data: Path, rays: int, progress: gs.Progress) -> dict:
     """Scores on the ray-traced captures, and of our own tracer on the points, with so many rays."""
     imager, points = gs.read_design(data / "P1.toml").imager(), points_of(data, "d")
-    electrons = lambda s: GAIN * (gs.read_capture(data / f"P1_{s}.tif", imager.sensor.shape).astype(np.float64) - BLACK)
-    target = json.loads((data / "f.json").read_text())["elements"]
-    words = json.loads((data / "h.json").read_text())["planes"]
+    image = lambda scene: electrons(gs.read_capture(data / f"P1_{scene}.tif", imager.sensor.shape))
     results = {
-        "letters": of_volume(np.concatenate([strokes(w) for w in words]), imager, 0.012, electrons("h"), progress),
-        "USAF target": of_volume(bars(target), imager, 0.005, electrons("f"), progress),
-        "120 points": of_points(points, imager, capture := electrons("d"), progress),
+        "letters": of_volume(words(data / "h.json"), imager, 0.012, image("h"), progress),
+        "USAF target": of_volume(target(data / "f.json"), imager, 0.005, image("f"), progress),
+        "120 points": of_points(points, imager, capture := image("d"), progress),
     }
     if rays:
         results["120 points"]["own tracer"] = scores(traced(points, imager, rays), capture)
     return results
+
+
+def electrons(capture: np.ndarray) -> np.ndarray:
+    """Electrons of a ray-traced capture in counts."""
+    return GAIN * (capture.astype(np.float64) - BLACK)
+
+
+def words(scene: Path) -> np.ndarray:
+    """Emitters of the words of a ray-traced scene."""
+    return np.concatenate([strokes(plane) for plane in json.loads(scene.read_text())["planes"]])
+
+
+def target(scene: Path) -> np.ndarray:
+    """Emitters of the resolution target of a ray-traced scene."""
+    return bars(json.loads(scene.read_text())["elements"])
 
 
 def strokes(plane: dict, pitch: float = 0.012) -> np.ndarray:
@@ -223,8 +235,8 @@ def report(data: Path | None, progress: gs.Progress) -> Report:
     departure = (
         f"Zones of Eq. (2) move {zones['mean']:.0%} of a point's light to other lenses, {zones['worst']:.0%} at most."
     )
-    text = f"# What the forward model explains\n\n{markdown_table(columns, rows)}\n\n{departure}\n"
-    return Report({"true_image.json": results, "true_image.md": text}, [table(columns, rows), departure])
+    title = "What the forward model explains"
+    return tables_report("true_image", results, (columns, rows), title=title, text=departure)
 
 
 if __name__ == "__main__":
