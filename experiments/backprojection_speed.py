@@ -2,10 +2,9 @@
 
 The paper takes 18 s for an image of 5120^2 pixels, 13 depths of 555^2 voxels and 213 lenses (MATLAB, nearest pixel,
 8 threads). On a processor `gs_jax` runs the same problem against the paper's loop and per-lens patches in parallel
-numba, which compute the same sum (bilinear, float32) on all cores; compilation is timed separately. On a GPU or TPU it
-runs against kernels in CUDA, where CuPy is installed: "of many" is the time of a call where ten are started one after
-the other, so that the host prepares the next while the device computes, and "from the host" includes the transfer of a
-camera's uint16 image. Results are compared before they are timed in interleaved rounds.
+numba, which compute the same sum (bilinear, float32) on all cores. On a GPU or TPU it runs against kernels in CUDA,
+where CuPy is installed: "of many" is the time of a call where ten are started one after the other, and "from the host"
+includes the transfer of a camera's uint16 image. Results are compared before they are timed in interleaved rounds.
 
     python -m experiments.backprojection_speed [--out DIR]
 

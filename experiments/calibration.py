@@ -1,11 +1,9 @@
 """Calibration with ray-traced captures of single points, and with simulated random devices.
 
-- Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm off it): fits with the default and with all
-  parameters, and prediction errors at a depth that a fit did not use. Then `find_points` on 120 points, with the
-  calibrated and the nominal design; and calibration from their capture alone, with a design that is rotated.
-- Random devices, simulated with all light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of up to
-  2 mm, a tilt of up to 1 degree in each direction, a sensor distance up to 20 % off; three captures each. Deviations
-  from the truth are given in standard deviations of the calibration.
+- Ray-traced captures of 15 points: fits with the default and with all parameters, and prediction errors at a depth that
+  a fit did not use; `find_points` on 120 points with the calibrated and the nominal design; calibration from their
+  capture alone, with a design that is rotated.
+- Random devices, simulated with all light and noise; deviations are in standard deviations of the calibration.
 - Mistakes: the residuals that a fit of sensor distance, rotation and shift leaves if something else is wrong, by the
   chief rays of the built-in design and sources at the four positions of `design/LAB.md`.
 

@@ -1,18 +1,11 @@
 """Judge of designs: scenes of four kinds, ray-traced with equal exposure, and what is reconstructed of them.
 
 Letters with bars, beads, tilted sheets and dense texture lie at three depths of a span, at random places and turns.
-`experiments/ray_tracer.py`, which shares no code with `gs_jax`, images them through the lenses about the middle, onto
-the middle of the design's own sensor, and the diffraction of their clear area blurs the images. Photon and read noise
-are those of one exposure time for all designs: 20,000, 3,000 or 500 electrons in the brightest pixel of `geomscope`.
-Volumes are reconstructed with the full model on a grid that is the same for all, 40 x 40 x 300 um, three planes about
-each depth: by Richardson-Lucy, with the best of three numbers of steps for each scene, and by the unrolled inversion,
-on voxels half as wide, which are then shared linearly by those of the grid. Scores, after the best gain: PSNR and SSIM;
-the contrast of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of two designs are of
-the same scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with its own noise. A
-second table has the error that the full model leaves of images without noise, of scenes that lie in planes.
-
-With `--images model` the full model makes the images, from voxels as fine as the unrolled inversion's: the scores that
-a model without errors would have.
+`experiments/ray_tracer.py`, which shares no code with `gs_jax`, images them through the middle of each design, and the
+diffraction of its clear area blurs the images; noise is that of one exposure time for all designs. Volumes are on the
+same grid for all, three planes about each depth. Scores, after the best gain: PSNR and SSIM; the contrast of bars of 60
+um over that of the truth; F1 of beads. Intervals are by a bootstrap over squares of 0.7 mm. A second table has what the
+full model leaves of images without noise; with `--images model` it makes the images itself.
 
     python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--exposures 3000]
         [--rays 10000] [--width 0.5] [--images {rays,model}] [--records FILE]

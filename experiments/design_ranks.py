@@ -1,12 +1,9 @@
 """Whether objectives rank designs as reconstructed scenes do: Spearman's correlations with a judge of reduced cost.
 
-Designs are the shipped ones and random ones between bounds of R, D, conic constant, pitch, side and layout, with v from
-0.8 to 1.2 of the paraxial focus. The judge is that of `experiments/design_judge.py` on a field of 1.2 mm, at 3,000
-electrons: letters, beads and texture at 18.4, 20.5 and 22.6 mm, traced by rays, with noise of one exposure time. Its
-solver is Richardson-Lucy with a system matrix of rays and diffraction of its own, which takes seconds where the full
-model takes minutes; a scene counts with its best number of steps. The mean of the PSNR is compared with each term of
-studies, and with the judge's own repeat, of other scenes and noise: for all designs, and for the better half, in which
-focus is no longer what tells them apart. Intervals are 95 %, by a bootstrap over designs.
+Designs are the shipped ones and random ones, in focus or nearly. The judge is that of `experiments/design_judge.py` on
+a field of 1.2 mm, at 3,000 electrons. Its solver is Richardson-Lucy with a system matrix of rays and diffraction of its
+own, which takes seconds where the full model takes minutes; a scene counts with its best number of steps. The judge's
+own repeat is of other scenes and noise. In the better half of the designs focus is no longer what tells them apart.
 
     python -m experiments.design_ranks [DESIGN.toml ...] [--records FILE] [--out DIR]
 
@@ -71,7 +68,6 @@ BETTER = {
 def random_design(seed: int) -> Design:
     """A device that could be made, in focus or nearly."""
     rng = np.random.default_rng(seed)
-    data = geomscope().model_dump()
     side, pitch = rng.choice(["plano", "curved"]), rng.uniform(1.0, 1.5)
     conic = rng.uniform(-1.2, 0.3) * rng.integers(0, 2)
     radius, thickness = rng.uniform(1.0, 2.2), 1 / 1.43
@@ -87,11 +83,11 @@ def random_design(seed: int) -> Design:
         )
     else:
         centers = hexagonal_layout((width, width), pitch=pitch)
-    data["lens"] |= {"orientation": str(side), "conic_constant": float(conic)}
-    data["lens"] |= {"radius_of_curvature_mm": radius, "aperture_diameter_mm": float(diameter)}
-    data["array"] |= {"centers_mm": tuple(map(tuple, np.asarray(centers).tolist())), "size_mm": (width, width)}
-    data["imaging"] |= {"sensor_distance_mm": float(min(distance, 6.0))}
-    return Design.model_validate(data | {"name": RANDOM[seed], "provenance": {}})
+    lens = {"orientation": str(side), "conic_constant": float(conic)}
+    lens |= {"radius_of_curvature_mm": radius, "aperture_diameter_mm": float(diameter)}
+    array = {"centers_mm": np.asarray(centers), "size_mm": (width, width)}
+    design = geomscope().replace(**lens, **array, sensor_distance_mm=float(min(distance, 6.0)))
+    return design.model_copy(update={"name": RANDOM[seed], "provenance": {}})
 
 
 def binning_of(imager: Imager) -> int:

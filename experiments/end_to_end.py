@@ -1,10 +1,8 @@
 """End-to-end loss: how well random scenes are reconstructed from their noisy images by back-projection.
 
-`reconstruction_loss` is a loss for `gs_jax.optimize` and stochastic optimisers, differentiable with respect to the
-imager: the layouts of `results/layout.md` follow its gradient. One key gives one smooth function.
-
-The reconstruction is normalised `backproject` minus its local background: light from other depths gives a smooth haze
-whose low frequencies no layout can remove, because the lenses that see a point lie within one field radius.
+`reconstruction_loss` is a loss for `gs_jax.optimize` and stochastic optimisers: the layouts of `results/layout.md`
+follow its gradient. One key gives one smooth function. The reconstruction is normalised `backproject` minus its local
+background: light from other depths gives a smooth haze whose low frequencies no layout can remove.
 """
 
 import jax

@@ -2,8 +2,7 @@
 
 Points at 20 mm (one alone, two 40 um apart laterally, two 300 um apart axially), and a point on the axis at each depth,
 are imaged by the focused design and back-projected. Images come from our forward model with diffraction and, if DATA is
-given, from an independent ray tracer. The paper reports widths of about 40 um and 300 um, stable over about 5 mm around
-20 mm, and both pairs resolved, the lateral one with a dip to about 85 %.
+given, from an independent ray tracer. `BARS` has what the paper reports.
 
     python -m experiments.fig3_resolution [DATA] [--out DIR]
 
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.signal import peak_widths
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax import Design, Grid, Imager, Progress, backproject, read_capture
@@ -47,17 +47,12 @@ def through_peak(volume: np.ndarray, grid: Grid) -> dict[str, tuple[np.ndarray, 
 
 def fwhm(coordinate: np.ndarray, profile: np.ndarray) -> float:
     """Full width at half maximum, linear between samples; infinite if the profile does not fall to a half."""
-    half, peak = profile.max() / 2, int(profile.argmax())
-    width = 0.0
-    for side in (slice(peak, None), slice(peak, None, -1)):
-        values, positions = profile[side], coordinate[side]
-        below = np.flatnonzero(values < half)
-        if not below.size:
-            return float("inf")
-        b = below[0]
-        share = (values[b - 1] - half) / (values[b - 1] - values[b])
-        width += abs(positions[b - 1] + share * (positions[b] - positions[b - 1]) - positions[0])
-    return float(width)
+    peak = int(profile.argmax())
+    if max(profile[: peak + 1].min(), profile[peak:].min()) >= profile[peak] / 2:
+        return float("inf")
+    height_above_zero = (profile[[peak]], np.array([0]), np.array([len(profile) - 1]))
+    _, _, left, right = peak_widths(profile, [peak], prominence_data=height_above_zero)
+    return float(np.diff(np.interp([*left, *right], np.arange(len(profile)), coordinate))[0])
 
 
 def dip(coordinate: np.ndarray, profile: np.ndarray) -> float:

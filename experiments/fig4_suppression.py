@@ -1,12 +1,9 @@
 """Figs. 4A and 7: points and beads in 3-D, by plain back-projection, particle clustering and `find_points`.
 
-120 points at 18 to 22 mm are reconstructed and shown at three depths: the plain stack, the stack rendered from the
-points that `find_points` detects, and the truth. The table compares methods: an empty volume, the peaks above a
-threshold (scikit-image), the paper's particle clustering, and `find_points`. Images come from our simulation (all
-light, shot and read noise) and, if DATA is given, from an independent ray tracer, with haze and clipped apertures.
-
-The paper embeds 5 um beads in a slab about 2.5 mm thick. Ours are balls filled with emitters, of different brightness;
-`find_points` uses neither radius nor brightness.
+120 points at 18 to 22 mm: the plain stack, the stack rendered from the points that `find_points` detects, and the
+truth. Images come from our simulation (all light, shot and read noise) and, with DATA, from an independent ray tracer,
+with haze and clipped apertures. Fig. 7: 5 um beads in a slab, which are balls filled with emitters, of different
+brightness; `find_points` uses neither radius nor brightness.
 
     python -m experiments.fig4_suppression [DATA] [--out DIR]
 
@@ -117,22 +114,15 @@ def _peaks(volume: np.ndarray, grid: gs.Grid, threshold: float) -> np.ndarray:
 
 
 def _scores(detections, truth, expected, grid) -> dict:
-    score = gs.localization(detections, truth)
-    stack = gs.quality(np.asarray(gs.rasterize(detections, grid)), expected)
+    score, stack = gs.localization(detections, truth), gs.quality(np.asarray(gs.rasterize(detections, grid)), expected)
     a, b = detections[score.pairs[:, 0]], truth[score.pairs[:, 1]]
     ratio = a[:, 3] / b[:, 3]
     paired = len(ratio) > 0
-    return {
-        "found": len(detections),
-        "precision": score.precision,
-        "recall": score.recall,
-        "f1": score.f1,
-        "lateral_rmse_um": 1000 * score.lateral_rmse,
-        "axial_rmse_um": 1000 * score.axial_rmse,
-        "axial_bias_um": 1000 * float((a[:, 2] - b[:, 2]).mean()) if paired else None,
-        # Standard deviation of the intensity ratio, relative to its mean.
-        "intensity_sd": float(ratio.std() / ratio.mean()) if paired else None,
-    } | stack._asdict()
+    scores = {"found": len(detections)} | density_scores([(detections, truth)]) | stack._asdict()
+    scores["axial_bias_um"] = 1000 * float((a[:, 2] - b[:, 2]).mean()) if paired else None
+    # Standard deviation of the intensity ratio, relative to its mean.
+    scores["intensity_sd"] = float(ratio.std() / ratio.mean()) if paired else None
+    return scores
 
 
 def picture(result: dict) -> Figure:

@@ -1,10 +1,9 @@
 """Figs. 4 and 8: background suppression by networks, for a snowflake, letters and a resolution target.
 
 Captures are back-projected and then cleaned by the paper's network, which sees one slice at a time, and by ours, which
-sees seven. Neither network saw these scenes or this layout in training, and our voxel model rendered none of the
-captures: two come from an independent ray tracer (if DATA is given), two from points that are finer than any voxel,
-with all light, and all have camera noise. The truth is the scene on the voxels, blurred laterally by one voxel
-(standard deviation), so that sub-voxel shifts do not matter.
+sees seven. Neither saw these scenes or this layout in training. Two captures come from an independent ray tracer (if
+DATA is given), two from points that are finer than any voxel, with all light, and all have camera noise. The truth is
+the scene on the voxels, blurred laterally by one voxel, so that sub-voxel shifts do not matter.
 
     python -m experiments.fig8_snowflake [DATA] [--out DIR]
 
@@ -52,7 +51,12 @@ def run(design: gs.Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, pro
     """Return per scene the truth, volumes and scores by method, and the response to noise."""
     imager = design.imager()
     grid = gs.Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
-    captures = {name: _simulated(emitters, design, progress) for name, emitters in simulated_scenes().items()}
+    flake = snowflake((18.0, 22.0), size=14.0, tilt=0.4, width=0.5, pitch=EMITTERS_MM)
+    captures = {}
+    for name, emitters in (("snowflake, simulated", flake), ("letters, simulated", words(EMITTERS_MM))):
+        light = simulate_points(emitters, imager, kind="full", progress=progress)
+        counts = gs.expose(np.maximum(light, 0), gs.Camera(), jax.random.key(0), peak_electrons=PEAK_ELECTRONS)
+        captures[name] = np.asarray(counts), emitters
     if data:
         for name, scene, emitters_of in (("letters", "h", true_image.words), ("USAF target", "f", true_image.target)):
             image = gs.read_capture(data / f"P1_{scene}.tif", imager.sensor.shape)
@@ -63,31 +67,15 @@ def run(design: gs.Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, pro
         # The target is small; reconstruct only its part of the field.
         half = round(_TARGET_MM / voxel_mm) if "USAF" in name else max(grid.shape)
         part = slice(None), *(slice(max(n // 2 - half, 0), n // 2 + half + 1) for n in grid.shape)
-        volume = _back_projected(counts, imager, grid, progress)
-        scenes[name] = {"truth": truth[part], **_judged(volume[part], truth[part])}
+        volume = _back_projected(counts, imager, grid, progress)[part]
+        volumes = {method: function(volume) for method, function in METHODS.items()}
+        scores = {method: gs.quality(cleaned, truth[part])._asdict() for method, cleaned in volumes.items()}
+        scenes[name] = {"truth": truth[part], "volumes": volumes, "scores": scores}
     return {"scenes": scenes, "noise": _of_noise(imager, grid, progress)}
-
-
-def _judged(volume: np.ndarray, truth: np.ndarray) -> dict:
-    volumes = {method: function(volume) for method, function in METHODS.items()}
-    scores = {method: gs.quality(cleaned, truth)._asdict() for method, cleaned in volumes.items()}
-    return {"volumes": volumes, "scores": scores}
 
 
 def _back_projected(counts: np.ndarray, imager: gs.Imager, grid: gs.Grid, progress: gs.Progress) -> np.ndarray:
     return gs.reconstruct(electrons(counts, gs.Camera()), imager, grid, progress=progress)
-
-
-def simulated_scenes() -> dict[str, np.ndarray]:
-    """Emitters of an inclined snowflake, and of a word on each of three planes."""
-    flake = snowflake((18.0, 22.0), size=14.0, tilt=0.4, width=0.5, pitch=EMITTERS_MM)
-    return {"snowflake, simulated": flake, "letters, simulated": words(EMITTERS_MM)}
-
-
-def _simulated(emitters: np.ndarray, design: gs.Design, progress: gs.Progress) -> tuple[np.ndarray, np.ndarray]:
-    light = simulate_points(emitters, design.imager(), kind="full", progress=progress)
-    counts = gs.expose(np.maximum(light, 0), gs.Camera(), jax.random.key(0), peak_electrons=PEAK_ELECTRONS)
-    return np.asarray(counts), emitters
 
 
 def _of_noise(imager: gs.Imager, grid: gs.Grid, progress: gs.Progress) -> dict:

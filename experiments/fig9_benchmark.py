@@ -1,21 +1,16 @@
 """Fig. 9 (B-D) on ray-traced images: every method with its defaults on whole captures.
 
-`gs-jax benchmark` compares times and, on simulated particles, quality. Here every method does what the command line
-does with a whole capture. Another group's tracer made three captures (exact refraction, aberrations, clipped lenses,
-noise, a camera's offset): 120 points between 18 and 22 mm, letters in three of nine planes, a USAF target at 18 mm. Our
-own tracer, which shares no code with the package, made an inclined snowflake with the same lenses, and letters with
-other lenses, layout and depths. Iterative methods take 20 steps with the full model; back-projection and the methods
-that build on it use the same voxels, four pixels wide. True points, and points that a method detects, are rendered as
-wide as the microscope resolves (Eq. 5: a voxel). The tables include an empty volume and the truth itself as bounds. F1
-is that of the number of brightest peaks of a volume, or points, that scores best: a threshold that no user has, and
-that favours the volumes. "Imaged again" is the difference between the volume's image and the capture
-(`gs_jax.forward_residual`).
+Another group's tracer made three captures: points, letters and a USAF target. Our own tracer, which shares no code with
+the package, made an inclined snowflake with the same lenses, and letters with other lenses, layout and depths. True
+points, and points that a method detects, are rendered as wide as the microscope resolves (Eq. 5: a voxel), and match
+within 0.1 mm laterally and 0.6 mm axially. F1 is that of the number of brightest peaks of a volume, or points, that
+scores best: a threshold that no user has, and that favours the volumes. "Imaged again" is the difference between the
+volume's image and the capture (`gs_jax.forward_residual`).
 
     python -m experiments.fig9_benchmark DATA [--out DIR] [--scenes letters,points] [--weights FILE]
 
-DATA holds `P1.toml`, `P1_*.tif` and their truth, `*.json`. Points match within 0.1 mm laterally and 0.6 mm axially,
-because the voxels are coarse. FILE is the output of `gs-jax train --network unrolled`, used instead of the shipped
-weights. Writes `captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
+DATA holds `P1.toml`, `P1_*.tif` and their truth, `*.json`; FILE is the output of `gs-jax train --network unrolled`.
+Writes `captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
 """
 
 from collections.abc import Callable, Sequence

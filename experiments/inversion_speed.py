@@ -1,8 +1,7 @@
 """Time and memory of the forward models, the iterative methods at their defaults, and three other functions.
 
 The scene has bars of three widths and points at nine depths, and its capture 5120 x 5120 pixels, rendered by the full
-model. Each line runs in a process of its own, one after the other; the first call is timed apart, as it compiles.
-Processor time varies less than time by the clock where other programs run.
+model. Each line runs in a process of its own; the first call is timed apart, as it compiles.
 
     python -m experiments.inversion_speed [--methods list-rl,richardson-lucy] [--pixels 5120] [--out DIR]
 

@@ -1,8 +1,7 @@
 """Sharpness against light, for plano or curved side facing the object, spheres or conics.
 
-For each lens type and share of the light the search of `design/studies/lens-kinds.toml` minimises the width of the spot
-from 18 to 23 mm. The designs are evaluated by quantities that the search does not use: Optiland's rays over the field,
-and the diffraction PSF.
+The search of `design/studies/lens-kinds.toml` minimises the width of the spot for each share of the light. Optiland's
+rays over the field and the diffraction PSF, which the search does not use, evaluate the designs.
 
     python -m experiments.lens_kinds [--out DIR]
 

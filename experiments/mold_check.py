@@ -16,7 +16,7 @@ import numpy as np
 
 from experiments.common import Report, main, tables_report
 from gs_jax import Design, Imager, Progress, geomscope, read_design
-from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
+from gs_jax.mold.export import float32_mesh, read_mesh, write_mesh
 from gs_jax.mold.lenslets import Part
 from gs_jax.mold.measurement import measure_lenslets, summarize
 from gs_jax.mold.solids import (
@@ -57,8 +57,11 @@ def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     part, shape = Part(imager.array), MoldShape(label=label)
     array = array_solid(part, chord_um / 1000)
     mold = mold_solid(part, array, shape)
+    meshes = []
     with tempfile.TemporaryDirectory() as folder:
-        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (array, mold)]
+        for solid in (array, mold):
+            write_mesh(path := Path(folder) / "part.stl", float32_mesh(solid), "part")
+            meshes.append(read_mesh(path))
     volumes = [mesh.solid().volume() for mesh in meshes]
     block = float(np.prod(np.diff(mold_bounds(part, shape), axis=0)))
     engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(part, shape))
@@ -73,11 +76,6 @@ def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
         "cast_is_array_error": cast / array.volume() - 1,
         **numbers,
     }
-
-
-def _through_file(solid, path: Path) -> Mesh:
-    write_mesh(path, float32_mesh(solid), "part")
-    return read_mesh(path)
 
 
 COLUMNS = {
@@ -95,18 +93,15 @@ COLUMNS = {
 }
 
 
-def rows(records: list[dict]) -> list[list[str]]:
-    return [[form.format(record[key]) for key, (_, form) in COLUMNS.items()] for record in records]
-
-
 def report(progress: Progress) -> Report:
     design = read_design(CENTERS) if CENTERS.exists() else geomscope()
     records = run(design, progress=progress)
     others = [
         measure(differing(design.imager()), chord_um) for chord_um in progress.track((0.5, 2.0), "Unequal lenses")
     ]
-    titles, lines, unequal = [title for title, _ in COLUMNS.values()], rows(records), rows(others)
-    return tables_report("mold", {"alike": records, "unequal": others}, (titles, lines), (titles, unequal))
+    titles, results = [title for title, _ in COLUMNS.values()], {"alike": records, "unequal": others}
+    row = lambda record: [form.format(record[key]) for key, (_, form) in COLUMNS.items()]
+    return tables_report("mold", results, *((titles, [row(record) for record in part]) for part in results.values()))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,9 @@
 """Exact rays and PSF of one lenslet against an independent ray tracer, and against ray-traced captures.
 
-Optiland (a general ray tracer) sends rays through the same plane, plate and sphere, or aspheres with either side
-facing the object. The script compares landing points and optical paths, and the resulting spot size, wavefront error
-and Strehl ratio against field and depth, with third-order theory beside them. With a folder of ray-traced captures, it
-compares the spots of each lens for a single point with our PSF in position, size and brightness.
-
-Eqs. (1) and (3): the images of a point at depth z are the layout of the lenses scaled by `s_z = (z' + v) / z'`, and
-each lens magnifies by `M_z = s_z - 1`; z' is the reduced depth. The scale is measured with the layout alone: spots in
-captures of a point on the axis are matched with the lenses, and a line through spot against lens positions is fitted.
-The paper says that s_z is constant over the field and "scales linearly with depth".
+Optiland (a general ray tracer) sends rays through the same surfaces: landing points, optical paths, spot sizes,
+wavefront errors and Strehl ratios are compared against field and depth, with third-order theory beside them. With DATA,
+the spots of each lens for a single point are compared with our PSF in position, size and brightness. The scale of the
+pattern of spots (Eq. 1) is the slope of a line through the positions of spots against those of their lenses.
 
     python -m experiments.optics_check [DATA] [--out DIR]
 
@@ -129,6 +124,7 @@ def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) 
     theirs, slopes, path = optiland_rays(imager, depth, np.vstack([[0, 0], points]), field)
     ours = trace_lenslet(imager, depth, points, (field, 0.0))
     error = _on_sphere(theirs, slopes, path, imager)
+    seidel = seidel_of_array(imager.array, radius, imager.reduced_depth(depth), field, imager.reduced_sensor_distance)
     mean, mine, off = weights @ theirs[1:], np.asarray(ours.landing), (field, 0.0)
     return {
         "depth_mm": depth,
@@ -139,7 +135,7 @@ def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) 
         "spot_rms_optiland_um": 1000 * float(np.sqrt(weights @ ((theirs[1:] - mean) ** 2).sum(1))),
         "wavefront_rms_waves": float(wavefront_rms(imager, depth, field=off, radius=radius)) / WAVELENGTH,
         "wavefront_rms_optiland_waves": _rms(error, points, weights) / WAVELENGTH,
-        "wavefront_rms_third_order_waves": _third_order(imager, depth, field, radius) / WAVELENGTH,
+        "wavefront_rms_third_order_waves": float(independent_rms(seidel)) / WAVELENGTH,
         "strehl": float(strehl(imager, depth, field=off, radius=radius)),
         "strehl_optiland": _strehl(imager, (theirs, slopes, path), points, weights),
     }
@@ -186,11 +182,6 @@ def _strehl(imager: Imager, rays: Rays, points: np.ndarray, weights: np.ndarray)
     x, y = np.arange(-0.06, 0.06, 5e-4), np.arange(-0.002, 0.0021, 1e-3)
     _, start = min((dark(middle + (a, b)), (middle[0] + a, middle[1] + b)) for a in x for b in y)
     return float(-minimize(dark, start, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9}).fun)
-
-
-def _third_order(imager: Imager, depth: float, field: float, radius: float) -> float:
-    error = seidel_of_array(imager.array, radius, imager.reduced_depth(depth), field, imager.reduced_sensor_distance)
-    return float(independent_rms(error))
 
 
 def spots(data: Path, scene: str, design: str = "P1", half: int = 64, reach: float = 3.0) -> list[dict]:
@@ -280,11 +271,9 @@ def summary(rows: list[dict]) -> dict:
 
 def run(fields=FIELDS, depths=DEPTHS) -> dict:
     """Compare with Optiland over the field, and over the depth on the axis, with the sensor focused for 20 mm."""
-    imager = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((3, 3), 0.0045), 5.8, 3.0)
-    v = best_focus(imager, 20.0, radius=RADIUS)
-    imager = eqx.tree_at(lambda i: i.sensor_distance, imager, v)
+    imager = focused()
     return {
-        "sensor_distance_mm": float(v),
+        "sensor_distance_mm": float(imager.sensor_distance),
         "pupil_radius_mm": RADIUS,
         "field": [compare(imager, 20.0, h) for h in fields],
         "depth": [compare(imager, z, 0.0) for z in depths],
@@ -293,21 +282,23 @@ def run(fields=FIELDS, depths=DEPTHS) -> dict:
 
 def shapes(fields=(0.0, 1.5, 3.0)) -> dict:
     """Compare aspheres with either side facing the object with Optiland, each with the sensor focused for 20 mm."""
-    results = {}
-    for name, lens in SHAPES.items():
-        imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((3, 3), 0.0045), 5.8, 3.0)
-        focused = eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=RADIUS))
-        results[name] = [compare(focused, 20.0, field) for field in fields]
-    return results
+    imagers = {name: focused(**lens) for name, lens in SHAPES.items()}
+    return {name: [compare(imager, 20.0, field) for field in fields] for name, imager in imagers.items()}
+
+
+def focused(radius: float = RADIUS, **lens: Any) -> Imager:
+    """One lens, in focus for a point at 20 mm and this pupil."""
+    imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((3, 3), 0.0045), 5.8, 3.0)
+    return eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=radius))
 
 
 def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0)) -> list[dict]:
     """Eq. (9) against the PSF's peak, on the axis, for a point at 20 mm at the best focus of each aperture."""
-    imager, rows = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((3, 3), 0.0045), 5.8, 3.0), []
+    rows = []
     for radius in radii:
-        focused = eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=radius))
-        waves = float(wavefront_rms(focused, 20.0, radius=radius)) / WAVELENGTH
-        peak = float(strehl(focused, 20.0, radius=radius))
+        imager = focused(radius)
+        waves = float(wavefront_rms(imager, 20.0, radius=radius)) / WAVELENGTH
+        peak = float(strehl(imager, 20.0, radius=radius))
         equation = float(np.exp(-((2 * np.pi * waves) ** 2)))
         rows.append({"pupil_radius_mm": radius, "wavefront_rms_waves": waves, "strehl": peak, "equation_9": equation})
     return rows

@@ -1,10 +1,8 @@
 """Deconvolution of real captures by measured PSFs: time, memory and objective, ours, scico's and LenslessPiCam's.
 
-Volume: DiffuserCam's resolution target, at an angle, and 36 measured PSFs, the problem of scico's example
-`diffusercam_tv_admm` (Balke et al., J. Open Source Softw. 7, 4722, 2022). LenslessPiCam 1.0.8 takes no part, as its
-convolution keeps the images of planes apart instead of summing them. Plane: DiffuserCam's hand, at a quarter of its
-size and in full, with total variation of 1e-4 in ADMM alone. As in Waller Lab's tutorial the mean of the PSF's dark
-corner is subtracted from both images.
+Volume: the problem of scico's example `diffusercam_tv_admm` (Balke et al., J. Open Source Softw. 7, 4722, 2022), in
+which LenslessPiCam 1.0.8 takes no part, as its convolution keeps the images of planes apart. Plane: DiffuserCam's hand,
+at a quarter of its size and in full, less the mean of the PSF's dark corner, as in Waller Lab's tutorial.
 
 Each code and method runs in a process of its own, the codes in turn; steps on the plane in several rounds, with ratios
 of the same round. The objective of each step's scene is computed for all by the same lines of NumPy.
@@ -129,12 +127,6 @@ def on_plane(data: Path, factor: int, pythons: dict[str, str], rounds: int, prog
     return step_rows(records)
 
 
-def step_cells(pixels: str, row: dict) -> list[str]:
-    times = [f"{1000 * row[name]:.3g}" for name in ("seconds_a_step", "processor_seconds_a_step")]
-    rest = (f"{row['peak_mib']:.0f}", f"{row['objective']:.3g}")
-    return [pixels, row["method"], row["code"], times[0], f"{row['over_ours']:.2f}", times[1], *rest]
-
-
 def report(data: Path, scico: str | None, lensless: str | None, rounds: int, progress: Progress) -> Report:
     all_pythons = {"gs_jax": sys.executable, "scico": scico, "LenslessPiCam": lensless}
     pythons = {code: python for code, python in all_pythons.items() if python}
@@ -144,7 +136,13 @@ def report(data: Path, scico: str | None, lensless: str | None, rounds: int, pro
         for factor in STEPS
     }
     cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in row.values()] for row in of_volume]
-    steps = [step_cells(pixels, row) for pixels, rows in of_plane.items() for row in rows]
+    ms = lambda row, name: f"{1000 * row[name]:.3g}"
+    steps = [
+        [pixels, row["method"], row["code"], ms(row, "seconds_a_step"), f"{row['over_ours']:.2f}"]
+        + [ms(row, "processor_seconds_a_step"), f"{row['peak_mib']:.0f}", f"{row['objective']:.3g}"]
+        for pixels, rows in of_plane.items()
+        for row in rows
+    ]
     numbers = {"machine": describe(), "volume": of_volume, "plane": of_plane}
     return tables_report("peers", numbers, (VOLUME_COLUMNS, cells), (STEP_COLUMNS, steps))
 

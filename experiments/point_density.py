@@ -1,10 +1,8 @@
 """F1 score of `find_points` against the density of points.
 
-Random points over 20 x 20 mm and 18 to 22 mm, with intensities of 0.5 to 1.5, are imaged with all their light by
-`simulate_points`, which positions them finer than any voxel, and exposed with shot and read noise. `find_points` gets
-each capture with the same settings. The reference is the brightest peaks of the back-projection, as many as there are
-points, a number that a user does not know. The simulation places cores where `find_points` expects them, so the result
-is slightly optimistic; the ray-traced captures of `fig4_suppression` are not.
+Random points are imaged with all their light, and exposed with shot and read noise. The reference is the brightest
+peaks of the back-projection, as many as there are points, a number that a user does not know. The simulation places
+cores where `find_points` expects them, so the result is slightly optimistic; that of `fig4_suppression` is not.
 
 With `--draws N` instead: so many captures of 20 and of 30 beads, in air and in water, whose intensities differ by a
 factor of up to eight, by the 30 lenses in the middle of the design. False points are those without a true one within
@@ -68,7 +66,9 @@ def draws(design: gs.Design, number: int, beads: Iterable[int] = BEADS, *, progr
     for medium, (keys, depths) in MEDIA.items():
         imager = middle_of(design, keys).imager()
         grid = gs.Grid.over(imager.sensor, depths=[depths[0] - 0.2, depths[1] + 0.2], pitch=0.03)
-        corners = np.concatenate([corners_at(z) for z in np.linspace(*depths, 50)])
+        corners = np.array(
+            [[sign * BOX[0] / 2, sign * BOX[1] / 2, z] for z in np.linspace(*depths, 50) for sign in (-1, 1)]
+        )
         image_of = full_imager_of_points(corners, imager, progress)
         for count in beads:
             pairs = []
@@ -90,12 +90,6 @@ def middle_of(design: gs.Design, keys: dict) -> gs.Design:
     centers = centers[np.argsort(np.abs(centers).max(1), kind="stable")[:LENSES]]
     side = 2 * np.abs(centers).max() + 1.2
     return design.replace(centers_mm=centers, size_mm=(side, side), shape=(PIXELS, PIXELS), **keys)
-
-
-def corners_at(depth: float) -> np.ndarray:
-    """Corners of the beads' box at a depth."""
-    x, y = np.array(BOX) / 2
-    return np.array([[-x, -y, depth], [x, y, depth]])
 
 
 def brightest_peaks(

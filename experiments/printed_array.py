@@ -1,14 +1,9 @@
 """A real printed array: calibration from its one measured spot pattern, places of lenses left out, and spot widths.
 
-The image is the measured point spread function of a miniscope's printed array of 37 lenses of 37 radii (Randoscope),
-and the recipe that it was printed from. No place of the source is published, and the optics in front of the array, a
-GRIN objective, is not known: `calibrate` is given the image as a pattern, and finds mirror, rotation, shift and scale.
-
-- Each lens is left out of the fit, and its spot is predicted: by the similarity that calibration fits, and with a
-  smooth distortion of four more numbers (a stretch in two directions, and a third-order term).
-- The half-light radius of each spot is compared with that of exact rays through its lens, for a far source and for the
-  distance at which rays agree best; and with `w^2 = w_0^2 + k^2 (1 - R_0/R)^2` of a lens out of focus, where each
-  lens is left out of the fit, too.
+The image is the measured point spread function of a printed array (Randoscope), of which the source and the objective
+are not known: `calibrate` is given it as a pattern, and finds mirror, rotation, shift and scale. Each lens is left out
+of the fit, and its spot is predicted. The half-light radius of each spot is compared with that of exact rays through
+its lens, and with `w^2 = w_0^2 + k^2 (1 - R_0/R)^2` of a lens out of focus.
 
     python -m experiments.printed_array DATA [--out DIR]
 
@@ -73,12 +68,6 @@ def left_out_with_distortion(calibration: Calibration) -> np.ndarray:
     return np.stack([off.real, off.imag], -1)
 
 
-def measured_widths(image: np.ndarray, calibration: Calibration, pitch: float) -> np.ndarray:
-    """Half-light radius of each lens's spot, pixels."""
-    positions = np.asarray(calibration.imager.sensor.to_pixels(calibration.spots.positions))
-    return half_light_radii(image, positions, np.full(len(positions), pitch))
-
-
 def ray_widths(imager: Imager, depth: float) -> np.ndarray:
     """Half-light radius of each lens's rays of a point on its axis, mm."""
     types, widths = lenses_by_type(imager.array), np.zeros(len(imager.array.centers))
@@ -112,7 +101,8 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     lenses = calibration.spots.lenses
     radius = np.asarray(start.array.of_lenses("radius_of_curvature"))[lenses]
     pitch = pixels_per_mm * float(nearest_neighbour_distances(np.asarray(start.array.centers)).mean())
-    measured = measured_widths(image, calibration, pitch)
+    spots = np.asarray(calibration.imager.sensor.to_pixels(calibration.spots.positions))
+    measured = half_light_radii(image, spots, np.full(len(spots), pitch))
     with progress.step("Tracing rays"):
         rays = {depth: pixels_per_mm * ray_widths(start, depth)[lenses] for depth in (FAR, *SOURCES)}
     agree = lambda widths: float(np.corrcoef(widths, measured)[0, 1])
@@ -122,9 +112,8 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     numbers = defocus_law(radius, measured)
     rms = lambda off: float(np.sqrt((off**2).sum(-1).mean()))
     # Where a wide spot is depends on the window that looks.
-    centers = np.asarray(calibration.imager.sensor.to_pixels(calibration.spots.positions))
-    ones = np.ones(len(centers))
-    two = [mean_shift(image, centers, width * ones, pitch / 2 * ones, pitch / 4 * ones) for width in WINDOWS]
+    ones = np.ones(len(spots))
+    two = [mean_shift(image, spots, width * ones, pitch / 2 * ones, pitch / 4 * ones) for width in WINDOWS]
     wide = measured > np.median(measured)
     results = {
         "mirrored": calibration.mirrored,

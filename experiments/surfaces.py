@@ -1,15 +1,11 @@
 """Sheets fitted to ray-traced captures: depth, focus and volume, beside free voxels and the unrolled inversion.
 
-`ray_tracer.py` images a tilted snowflake, a curved leaf with veins, a hemisphere with texture, two sheets one behind
-the other, and blobs, which are no sheet, through the lenses of a design about the middle, onto 1024 x 1024 pixels of 9
-um. Noise is that of 10,000 or 500 electrons in the brightest pixel, and 2 of readout. Voxels are 80 um wide, planes 0.5
-mm apart. Columns: mean and standard deviation of the depth's error over lit columns, but rims steeper than 60 degrees;
-how many errors are within one predicted standard deviation; PSNR above an empty image or volume, blurred by one voxel,
-of the image in focus and of the volume, where the truth has each emitter on its nearest plane, or in linear shares of
-two planes; beside it that of the truth's own shares against its nearest planes, as a fit with the right depths has it,
-and, for the first scene, the unrolled inversion; what the sheets, and one sheet more, leave of the capture. Scenes
-without one depth have one exposure. Last, the processor time of a fit over that of the unrolled inversion, at the
-second exposure of the first scene, with tables and programs at hand.
+A tilted snowflake, a curved leaf with veins, a hemisphere with texture, two sheets one behind the other, and blobs,
+which are no sheet, are traced through the lenses about the middle of a design. Columns: mean and standard deviation of
+the depth's error over lit columns, but steep rims; how many errors are within one predicted standard deviation; PSNR
+above an empty image or volume, blurred by one voxel, of the image in focus and of the volume, where the truth has each
+emitter on its nearest plane, or in linear shares of two; that of the truth's own shares; that of the unrolled
+inversion; what the sheets, and one sheet more, leave of the capture. Scenes without one depth have one exposure.
 
     python -m experiments.surfaces [--design geomscope] [--scenes "curved leaf,hemisphere"] [--out DIR]
 
@@ -87,12 +83,9 @@ def make_scenes(width: float) -> dict[str, Emitters]:
     radius = np.hypot(x, y) / (0.35 * width)
     round_off = np.sqrt(np.maximum(1 - radius**2, 0))
     dome = sheet(radius < 0.97, far - 0.3 - (far - near - 0.6) * round_off, texture(x, y, 1))
-    front = sheet(
-        (np.abs(x + 0.1 * width) < 0.25 * width) & (np.abs(y) < 0.3 * width), near + 0.8 + 0.05 * y, texture(x, y, 2)
-    )
-    behind = sheet(
-        (np.abs(x - 0.1 * width) < 0.25 * width) & (np.abs(y) < 0.3 * width), far - 0.8 + 0.1 * x, texture(x, y, 3)
-    )
+    box = lambda middle: (np.abs(x - middle) < 0.25 * width) & (np.abs(y) < 0.3 * width)
+    front = sheet(box(-0.1 * width), near + 0.8 + 0.05 * y, texture(x, y, 2))
+    behind = sheet(box(0.1 * width), far - 0.8 + 0.1 * x, texture(x, y, 3))
     named = {"tilted snowflake": flake, "curved leaf": leaf, "hemisphere": dome}
     return named | {"two sheets": np.concatenate([front, behind]), "blobs": blobs(width, 0)}
 
@@ -116,9 +109,8 @@ def texture(x, y, seed: int, z: float | np.ndarray = 0.0) -> np.ndarray:
 
 def capture(emitters: Emitters, imager: Imager) -> np.ndarray:
     """The image without noise; emitters are placed within their squares."""
-    lit = emitters.copy()
-    lit[:, :2] += np.random.default_rng(0).uniform(-APART / 2, APART / 2, (len(lit), 2))
-    return traced(lit, imager, RAYS, TILE)
+    within = np.random.default_rng(0).uniform(-APART / 2, APART / 2, (len(emitters), 2))
+    return traced(emitters + np.pad(within, ((0, 0), (0, 2))), imager, RAYS, TILE)
 
 
 def true_maps(emitters: Emitters, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -55,6 +55,10 @@ def _performance(designs: tuple[Design, ...], sheets: list[dict]) -> list[tuple[
         low, high = min(sheet[key]), max(sheet[key])
         return format(low, form) if np.isclose(low, high) else f"{low:{form}}-{high:{form}}"
 
+    def object_blur(sheet):
+        middle = sheet["depth_mm"].index(20.0)
+        return f"{sheet['blur_um'][middle] / sheet['magnification'][middle] / 1000:.2f} mm"
+
     both = lambda key, form, unit="": tuple(f"{span(key, form, sheet)}{unit}" for sheet in sheets)
     field = [objectives.field_of_view(design.imager(), DEPTHS) for design in designs]
     return [
@@ -75,13 +79,8 @@ def _performance(designs: tuple[Design, ...], sheets: list[dict]) -> list[tuple[
             *(f"{sheet['numerical_aperture']:.2f}" for sheet in sheets),
             "area of the Voronoi cell; 0.13 takes the pitch for the diameter",
         ),
-        ("blur at 20 mm, in the object", "-", *(_object_blur(sheet) for sheet in sheets), "thin lens"),
+        ("blur at 20 mm, in the object", "-", *(object_blur(sheet) for sheet in sheets), "thin lens"),
     ]
-
-
-def _object_blur(sheet: dict) -> str:
-    middle = sheet["depth_mm"].index(20.0)
-    return f"{sheet['blur_um'][middle] / sheet['magnification'][middle] / 1000:.2f} mm"
 
 
 def _depth_of_field(design: Design) -> list[tuple[str, ...]]:

@@ -1,12 +1,9 @@
 """Ray-traced captures through a filter, a window and a cover slip into a gel, with the layers and without.
 
-Another group's tracer made the captures with the authors' lenses: three of single points in air, and two of a gel
-(PDMS) that begins at 19.67 mm and holds 100 points, or three planes of words. The three calibrate the device, with the
-filter and the window or with air in their place ("layers ignored"). Then nothing is fitted anew: with the layers, the
-gel and its cover slip are added as they are; without them, the object is in air. Columns are as in
-`experiments/true_image.py` and `experiments/fig9_benchmark.py`: the model's image, binned by 4, against the capture;
-points that `find_points` detects; PSNR of the words above an empty volume, on planes 0.8 mm apart: 0.56 mm of reduced
-depth, as planes 0.5 mm apart are in `experiments/fig9_benchmark.py`.
+Another group's tracer made the captures: three of single points in air calibrate the device, with the filter and the
+window or with air in their place ("layers ignored"). Then nothing is fitted anew: with the layers, the gel and its
+cover slip are added as they are; without them, the object is in air. Columns are as in `experiments/true_image.py` and
+`experiments/fig9_benchmark.py`; words are on planes 0.8 mm apart, 0.56 mm of reduced depth.
 
     python -m experiments.through_layers DATA [--out DIR] [--methods richardson-lucy,unrolled]
 
@@ -120,29 +117,25 @@ def report(data: Path, methods: list[str], progress: gs.Progress) -> Report:
     words = on_words(data, devices, methods, progress)
     cases, columns = CASES, ("", *CASES)
     row = lambda label, values: [label, *values]
+    with_error = lambda fit, name: f"{fit['values'][name]:.4f} +- {fit['deviations'][name]:.4f}"
     rows = [
         row("calibration in air: residual, pixels RMS", [f"{fits[case]['rms_px']:.3f}" for case in cases]),
-        *(row(name, [_with_error(fits[case], name) for case in cases]) for name in fits[CASES[0]]["values"]),
+        *(row(name, [with_error(fits[case], name) for case in cases]) for name in fits[CASES[0]]["values"]),
         row("points found, of 100", [str(points[case]["points"]) for case in cases]),
         row("F1", [f"{points[case]['f1']:.2f}" for case in cases]),
         row("lateral RMS, um", [f"{points[case]['lateral_rmse_um']:.1f}" for case in cases]),
         row("axial RMS, um", [f"{points[case]['axial_rmse_um']:.0f}" for case in cases]),
         row("axial bias, um", [f"{points[case]['axial_bias_um']:.0f}" for case in cases]),
         row("axial spread about the bias, um", [f"{points[case]['axial_spread_um']:.0f}" for case in cases]),
-        row("words, model: correlation, binned 4", [f"{_model(words, case, 'bin_4'):.3f}" for case in cases]),
+        row(
+            "words, model: correlation, binned 4",
+            [f"{words[case]['model']['bin_4']['correlation']:.3f}" for case in cases],
+        ),
         row("words, model: light", [f"{words[case]['model']['light']:.3f}" for case in cases]),
         *(row(f"words, {m}: dB above empty", [f"{words[c][m]:.1f}" for c in cases]) for m in methods),
     ]
     numbers = {"calibration": fits, "points": points, "words": words}
     return tables_report("layers", numbers, (columns, rows), title="Captures through layers")
-
-
-def _with_error(fit: dict, name: str) -> str:
-    return f"{fit['values'][name]:.4f} +- {fit['deviations'][name]:.4f}"
-
-
-def _model(words: dict, case: str, binned: str) -> float:
-    return words[case]["model"][binned]["correlation"]
 
 
 if __name__ == "__main__":

@@ -1,15 +1,10 @@
 """How much of an independently ray-traced image the forward model explains.
 
-The near model has one PSF, that on the axis, within the field radius; the full model has all transmitted light
-(`full_optics`, `full_image_of_points`). One gain per image is fitted, by least squares on its pixels, and nothing else.
-Error is the RMS of the difference over that of the image, correlation is Pearson's, both for the images and for both
-binned by 4 and 16; light is the model's sum over the image's.
-
-- Captures by another group's ray tracer with the authors' array, with noise: letters, a USAF target, 120 points.
-- Other devices, for which nothing was tuned, by `experiments/ray_tracer.py`, which shares no code with `gs_jax`
-  and is itself compared with the capture of the points.
-- Zones: Eq. (2) takes the envelope C at the centre of the zone that a voxel lies in, `gs_jax.forward` at the voxel. The
-  zone of a lens is its Voronoi cell, so the difference follows from the envelope alone.
+The near model has one PSF within the field radius, the full model all transmitted light. One gain per image is fitted,
+and nothing else. Error is the RMS of the difference over that of the image, correlation is Pearson's, for the images
+and for both binned by 4 and 16; light is the model's sum over the image's. Captures are another group's, with noise;
+images by other devices, for which nothing was tuned, are those of `experiments/ray_tracer.py`. Zones: Eq. (2) takes the
+envelope C at the centre of the zone that a voxel lies in, a Voronoi cell, `gs_jax.forward` at the voxel.
 
     python -m experiments.true_image [DATA] [--out DIR]
 
@@ -201,14 +196,11 @@ def zone_departure(
     # ApertureProfile' centroids, by the points themselves.
     middle = np.stack([np.bincount(zone, q, len(centers)) for q in place.T], -1) / np.bincount(zone)[:, None]
     reduced = imager.reduced_depth(depth)
-    light = lambda q: np.asarray(envelope(_squared(q, centers), reduced, imager.field_radius))
+    squared = lambda q: ((q[:, None] - centers[None]) ** 2).sum(-1)
+    light = lambda q: np.asarray(envelope(squared(q), reduced, imager.field_radius))
     exact = light(place)
     departure = np.abs(light(middle[zone]) - exact).sum(1) / exact.sum(1)
     return {"depth_mm": depth, "mean": float(departure.mean()), "worst": float(departure.max())}
-
-
-def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return ((a[:, None] - b[None]) ** 2).sum(-1)
 
 
 def run(

@@ -3,8 +3,7 @@
 A recording is reconstructed by the command line as one process and with workers; memory, a run that is killed and
 resumed, and the time forecast from few frames are measured at a smaller size. Then a camera writes the same frames as
 files at several rates, and `--watch` reconstructs them: the delay is from a capture's file to its volume's, beside
-reading, computing and writing one frame, one after the other. The latter are measured before and after, because other
-work may load the machine.
+reading, computing and writing one frame, one after the other.
 
     python -m experiments.video_rate [--frames 500] [--pixels 1024] [--many 1000] [--coarse 512] [--out DIR]
 """
@@ -54,10 +53,9 @@ LIVE = {
 
 def coarse_design(pixels: int) -> Design:
     """The built-in microscope with a camera of so many pixels in each direction on the same sensor."""
-    data = geomscope().model_dump()
-    across = data["sensor"]["shape"][0] * data["sensor"]["pixel_pitch_um"]
-    data["sensor"] |= {"shape": (pixels, pixels), "pixel_pitch_um": across / pixels}
-    return Design.model_validate(data)
+    design = geomscope()
+    across = design.sensor.shape[0] * design.sensor.pixel_pitch_um
+    return design.replace(shape=(pixels, pixels), pixel_pitch_um=across / pixels)
 
 
 def write_recording(path: Path, design: Design, frames: int) -> None:
