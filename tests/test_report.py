@@ -20,6 +20,7 @@ from gs_jax.apps.pictures import make_slices
 from gs_jax.apps.report import SLICE_BYTES, strip_folders, tolerance_section, voxel_view, write_report
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import search_report
+from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
@@ -94,6 +95,16 @@ def test_the_page_has_all_parts_and_no_path(made):
     assert "small &lt;/script&gt;&lt;b&gt;&amp;" in text and "<b>" not in text
     assert "10.1002/lpor.202100072" in text and "5.8123" in text and "50 % of 8 devices" in text
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "@import" not in text
+
+
+@pytest.mark.integration
+def test_cells_that_violate_an_assumption_are_marked(made):
+    """As many depths as are out of focus, or where spots are too wide or overlap."""
+    sheet = datasheet(design := read_design(made / "design.toml"))
+    wide = np.array(sheet["spot_width_um"]) > 2 * np.array(sheet["lateral_resolution_um"])
+    blurred = np.array(sheet["blur_um"]) > 2 * design.sensor.pixel_pitch_um
+    expected = wide.sum() + blurred.sum() + (np.array(sheet["occupancy"]) > 1).sum()
+    assert (made / "report.html").read_text().count('<td class="fault"') == expected > 0
 
 
 @pytest.mark.integration

@@ -3,7 +3,8 @@
 import json
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import repeat, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from rich.table import Table
 from ..base.errors import InputError
 from ..base.machine import describe
 from ..base.progress import Progress
-from ..design.datasheets import datasheet, findings, overview, summary, tables
+from ..design.datasheets import TABLES, datasheet, findings, overview, summary, tables, violations
 from ..design.design import Design, design_text, span_of
 from ..geometry import Imager
 from ..grid import Grid
@@ -152,7 +153,7 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     """Sections of the device, the datasheet, spots, contrast and layout."""
     with progress.step("Datasheet"):
         sheet = datasheet(design)
-        violations = findings(design, sheet)
+        remarks, faults = findings(design, sheet), violations(design, sheet)
     imager, depths = design.imager(), np.array(sheet["depth_mm"])
     middle = float(depths[len(depths) // 2])
     with progress.step("Drawing"):
@@ -173,8 +174,8 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     }
     return {
         "sheet": sheet,
-        "tables": [_cells(table) for table in tables(sheet)],
-        "violations": violations,
+        "tables": [_cells(*both, faults) for both in zip_longest(tables(sheet), TABLES.values(), fillvalue=())],
+        "violations": remarks,
         "device": [summary(design, sheet), *overview(design, sheet)],
         "keys": _device_rows(design),
         "section": section,
@@ -204,11 +205,12 @@ def _device_rows(design: Design) -> list[tuple[str, str]]:
     return [(key.replace("_", " "), str(value)) for key, value in rows.items()]
 
 
-def _cells(table: Table) -> dict[str, Any]:
-    """Title, heads and rows of a table for the terminal."""
+def _cells(table: Table, keys: Iterable[str], faults: Mapping[str, list[str]]) -> dict[str, Any]:
+    """Title, heads and rows of a table for the terminal; a cell is its text and what it violates."""
     heads = [str(column.header).replace("-\n", "").replace("\n", " ") for column in table.columns]
-    rows = list(zip(*(column.cells for column in table.columns), strict=True))
-    return {"title": table.title, "heads": heads, "rows": rows}
+    columns = zip_longest(table.columns, ("depth_mm", *keys))
+    marked = [zip(column.cells, faults.get(key) or repeat(""), strict=False) for column, key in columns]
+    return {"title": table.title, "heads": heads, "rows": list(zip(*marked, strict=True))}
 
 
 def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:

@@ -274,7 +274,7 @@ def format_band(sheet: dict[str, Any]) -> str:
     return f"from {ends}, {moved}RMS widths are {_plain(min(width))} to {_plain(max(width))} um in the object"
 
 
-_TABLES = {
+TABLES = {
     "In focus, without aberrations (Eqs. 1-8, 11)": {
         "magnification": "magnifi-\ncation",
         "scale": "scale",
@@ -305,7 +305,7 @@ _MOST_TYPES, _LEAST_STREHL = 6, 0.01
 def tables(sheet: dict[str, Any]) -> list[Table]:
     """A datasheet to read: an image in focus, how far out of focus it is, and what to expect. All fit 80 columns."""
     results = []
-    for title, heads in _TABLES.items():
+    for title, heads in TABLES.items():
         heads = {"depth_mm": "depth\nmm"} | heads
         columns = [[_plain(value) for value in sheet[key]] for key in heads]
         if "strehl_on_axis" in heads:
@@ -319,6 +319,21 @@ def tables(sheet: dict[str, Any]) -> list[Table]:
         title = "RMS width of a point's image by each type of lens: in the object, um"
         results.append(text_table(title, ["depth\nmm", *heads], zip(*columns, strict=True)))
     return results
+
+
+def violations(design: Design, sheet: dict[str, Any]) -> dict[str, list[str]]:
+    """By key of a datasheet, the assumption that the value at each depth violates, or an empty text."""
+    limit = 1000 * circle_of_confusion_of(design, None)
+    beyond = {
+        "blur_um": (sheet["blur_um"], [limit], f"more than the circle of confusion, {_plain(limit)} um: out of focus"),
+        "rms_width_um": (
+            sheet["spot_width_um"],
+            _FAR * np.array(sheet["lateral_resolution_um"]),
+            "2.355 times it, as of a Gaussian, is more than twice the prediction of Eq. 5",
+        ),
+        "occupancy": (sheet["occupancy"], [1.0], "sub-images of an object that fills the field overlap"),
+    }
+    return {key: np.where(np.greater(values, most), why, "").tolist() for key, (values, most, why) in beyond.items()}
 
 
 def text_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
