@@ -26,7 +26,7 @@ from experiments.phantoms import beads
 from experiments.point_density import scene, scores as density_scores
 from gs_jax.apps.benchmark import timed
 from gs_jax.apps.pictures import draw_image, label_of
-from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.particles import find_clusters
 from gs_jax.simulation.synthetic import simulate_points
 
 # Depths, mm.

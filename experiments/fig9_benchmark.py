@@ -29,7 +29,7 @@ from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, target, words
 from gs_jax.apps.benchmark import render_points, timed
 from gs_jax.apps.pictures import draw_image, label_of
-from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.particles import find_clusters
 from gs_jax.detection.unet import pretrained
 from gs_jax.optics.theory import FWHM
 from gs_jax.reconstruction.networks import read_unrolled

@@ -24,7 +24,7 @@ from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
 from gs_jax.calibration.spots import half_light_radii, mean_shift
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type
-from gs_jax.optics.lens_types import split_by_type
+from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.pupil import add_diffraction, aperture_profile, sample_pupil
 
 # The device: shape and pixels of the image, mm, as read 4 x 4; distance of the sensor, index of the resin, plate and

@@ -28,8 +28,8 @@ from gs_jax import Design, Progress, Reconstructor, geomscope, simulate, write_d
 from gs_jax.apps.benchmark import markdown_table
 from gs_jax.io.camera import prepare, read_frame
 from gs_jax.io.captures import Selection
+from gs_jax.io.ngff import JOURNAL, VolumeSeries
 from gs_jax.io.recordings import open_recording
-from gs_jax.io.volume_series import JOURNAL, VolumeSeries
 from gs_jax.reconstruction.pipeline import voxel_grid
 from gs_jax.simulation.phantoms import random_points
 

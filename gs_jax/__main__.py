@@ -29,8 +29,7 @@ _MAX_MESSAGE = 380
 # Commands by their modules in `gs_jax/cli`, imported when a command is used: some need seconds that others do not.
 _MODULES = {
     "reconstruct": ("reconstruct", "deconvolve"),
-    "calibrate": ("calibrate",),
-    "simulate": ("simulate",),
+    "captures": ("calibrate", "simulate"),
     "designs": ("metrics", "layout", "optimize", "pareto", "info"),
     "new_design": ("new-design",),
     "fabrication": ("tolerance", "mold", "mask", "heights"),

@@ -35,10 +35,9 @@ from gs_jax.base.progress import Progress
 from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
 from gs_jax.calibration.initial_guess import guess_without_lenses, match_pattern, match_shift
-from gs_jax.calibration.sources import Sources, Spots, alternatives
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
-from gs_jax.calibration.spots import find_spots
-from gs_jax.cli.calibrate import FIT_NAMES
+from gs_jax.calibration.spots import Sources, Spots, alternatives, find_spots
+from gs_jax.cli.captures import FIT_NAMES
 from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout
 from gs_jax.io.captures import read_capture
@@ -46,7 +45,7 @@ from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
 from gs_jax.layers import reduced_distance
 from gs_jax.lenses import lenses_by_type
-from gs_jax.optics.lens_types import split_by_type
+from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.raytrace import to_numpy
 
 from .helpers import needs

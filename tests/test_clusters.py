@@ -6,7 +6,7 @@ from skimage.measure import label
 
 from gs_jax import Grid
 from gs_jax.apps.benchmark import render_points
-from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.particles import find_clusters
 
 
 def volume_grid(shape=(5, 40, 40)) -> Grid:

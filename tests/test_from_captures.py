@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 import gs_jax as gs
-from gs_jax.apps.fine_tuning import FineTuned, _split, fine_tune
+from gs_jax.apps.training import FineTuned, _split, fine_tune
 from gs_jax.base.progress import Progress
 from gs_jax.cli.train import train_command
 from gs_jax.io.captures import write_capture
@@ -81,7 +81,7 @@ def test_the_design_with_the_fitted_radii_is_written_beside_the_weights(tmp_path
         return FineTuned(networks, [0.1], [(0, 0.1)], 0.04, 0.03)
 
     monkeypatch.setattr("gs_jax.reconstruction.radius_fit.fit_radius", fitted)
-    monkeypatch.setattr("gs_jax.apps.fine_tuning.fine_tune", trained)
+    monkeypatch.setattr("gs_jax.apps.training.fine_tune", trained)
     for number in range(2):
         write_capture(tmp_path / "run" / f"{number}.tif", np.full((96, 80), 7, np.uint16))
     few = CliRunner().invoke(train_command, command)

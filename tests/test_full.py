@@ -29,8 +29,7 @@ from gs_jax.detection.point_finder import find_points
 from gs_jax.geometry import falloff
 from gs_jax.optics import field_varying
 from gs_jax.optics.apertures import clear_area
-from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
-from gs_jax.optics.polar_grid import make_polar_grid, to_pixels_table
+from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf, make_polar_grid, to_pixels_table
 from gs_jax.optics.psf_core import (
     core_magnification,
     render_harmonics,

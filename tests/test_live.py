@@ -15,8 +15,8 @@ import tifffile
 from gs_jax import Grid, InputError
 from gs_jax.cli.recordings import _State
 from gs_jax.io.captures import read_capture
-from gs_jax.io.volume_series import JOURNAL, VolumeSeries, check_replaceable, read_series
-from gs_jax.io.watched_folder import WatchedFolder
+from gs_jax.io.ngff import JOURNAL, VolumeSeries, check_replaceable, read_series
+from gs_jax.io.recordings import WatchedFolder
 from gs_jax.reconstruction import recording as live
 
 from .test_cli import folder, run

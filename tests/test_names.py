@@ -12,9 +12,9 @@ import tifffile
 from gs_jax.base.errors import InputWarning
 from gs_jax.io.captures import Selection
 from gs_jax.io.names import first_gap, natural_order, plain_text
+from gs_jax.io.ngff import JOURNAL
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.recordings import open_recording, spot_names
-from gs_jax.io.volume_series import JOURNAL
 from gs_jax.io.volumes import read_volume, write_volume
 
 from .test_cli import folder, run

@@ -17,7 +17,7 @@ from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
-from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.particles import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.view_samples import detection_stats
 from gs_jax.layouts import interleave

@@ -16,9 +16,9 @@ import zarr
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
-from gs_jax.io import ngff, volume_series
+from gs_jax.io import ngff
+from gs_jax.io.ngff import JOURNAL, VolumeSeries, halve
 from gs_jax.io.provenance import read_provenance
-from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halve
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.reconstruction.recording import PREFETCH, reconstruct_frames
@@ -126,7 +126,6 @@ def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
 def test_what_viewers_are_told(folder, monkeypatch, capsys):
     """Time first, to scale; planes as chunks; a pyramid where a plane is larger than a chunk."""
     monkeypatch.setattr(ngff, "CHUNK", 16)
-    monkeypatch.setattr(volume_series, "CHUNK", 16)
     run(monkeypatch, capsys, *command(save("rec.tif"), "--frame-interval", "0.05"))
     attributes = json.loads((folder / "v.zarr" / "zarr.json").read_text())["attributes"]["ome"]
     (image,) = attributes["multiscales"]

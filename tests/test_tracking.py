@@ -8,7 +8,7 @@ import pytest
 import tifffile
 
 from gs_jax.base.errors import InputError
-from gs_jax.detection.linking import MEMORY, link_particles
+from gs_jax.detection.particles import MEMORY, link_particles
 from gs_jax.io.point_tables import read_points
 
 from .test_cli import folder, run

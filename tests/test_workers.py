@@ -16,7 +16,7 @@ import pytest
 
 from gs_jax.base.errors import InputError
 from gs_jax.base.workers import Workers
-from gs_jax.io.volume_series import JOURNAL
+from gs_jax.io.ngff import JOURNAL
 
 from .test_cli import folder, run
 from .test_recording import FRAMES, command, files, save, volumes

@@ -15,7 +15,7 @@ import tifffile
 from matplotlib import pyplot as plt
 
 import gs_jax as gs
-from gs_jax.io.volume_series import read_series
+from gs_jax.io.ngff import read_series
 from gs_jax.simulation.phantoms import random_points
 
 PIXELS = 800  # of each side of the sensor, 9 um each

@@ -36,7 +36,7 @@ from ..base.errors import InputError
 from ..base.machine import available_memory, describe, status_mib
 from ..base.progress import Progress
 from ..design.start import geomscope
-from ..detection.clusters import find_clusters
+from ..detection.particles import find_clusters
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
 from ..geometry import Imager

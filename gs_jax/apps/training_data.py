@@ -27,8 +27,7 @@ from ..grid import Grid, Sensor
 from ..io.files import atomic_write, decoding, make_folder
 from ..layouts import hexagonal_layout, poisson_disc_layout, random_layout
 from ..lenses import MicrolensArray
-from ..optics.field_varying import FieldVaryingPsf, field_varying_psf
-from ..optics.polar_grid import PolarGrid, make_polar_grid
+from ..optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_psf, make_polar_grid
 from ..optics.psf_core import RINGS, core_distortion
 from ..projection.backprojection import backproject
 from ..projection.forward_model import forward

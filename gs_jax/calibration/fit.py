@@ -24,7 +24,9 @@ from ..lenses import EACH
 from ..typing import Image
 from . import initial_guess as guesses, spot_model as model
 from .initial_guess import MIN_SPOTS, InitialGuess
-from .sources import (
+from .spot_model import FITTABLE, FITTED, OF_SAMPLE, CoreOffsets, Observations, Unknowns
+from .spots import (
+    NARROW_WINDOW,
     CaptureFit,
     MisfitError,
     Sources,
@@ -34,9 +36,9 @@ from .sources import (
     best_alternative,
     capture_fits,
     describe_misfit,
+    find_blurred_spots_mm,
+    find_spots_mm,
 )
-from .spot_model import FITTABLE, FITTED, OF_SAMPLE, CoreOffsets, Observations, Unknowns
-from .spots import NARROW_WINDOW, find_blurred_spots_mm, find_spots_mm
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)

@@ -25,8 +25,8 @@ from ..lenses import EACH, MicrolensArray
 from ..optics.psf_core import FIELDS, ensquared_light
 from ..optics.raytrace import to_numpy
 from ..typing import Image
-from .sources import CaptureFit, Sources, SpotLists, assign_spots, capture_fits
 from .spot_model import match_radius, trace_core_offsets, with_centers
+from .spots import CaptureFit, Sources, SpotLists, assign_spots, capture_fits
 
 # Brightest spots of each source that pairs begin with, and that are matched; sources and neighbours at most.
 _FIRST, _TRIED, _MOST_SOURCES, _NEIGHBOURS = 5, 20, 3, 12

@@ -24,7 +24,7 @@ from ..geometry import Imager
 from ..layers import Layers, object_surface
 from ..layouts import nearest_neighbour_distances
 from ..lenses import MicrolensArray, lenses_by_type
-from ..optics.lens_types import split_by_type
+from ..optics.apertures import split_by_type
 from ..optics.pupil import PupilSamples, aperture_profile, sample_pupil
 
 # Fields at which exact rays are traced, degree of the polynomial through them, and number of depths at most.

@@ -145,7 +145,7 @@ def reconstruct_command(
     if points:
         check_output(points, [".csv"])
     if recording.track:
-        from ..detection.linking import import_linker
+        from ..detection.particles import import_linker
 
         if not points:
             raise InputError("--track must be used with --points POINTS.csv, which has the particles.")

@@ -78,7 +78,7 @@ class SeriesRun:
         Raises `InputError` if the output cannot hold one, or options of recordings are given without one.
         """
         from ..io.names import first_gap
-        from ..io.volume_series import check_replaceable
+        from ..io.ngff import check_replaceable
 
         options, is_series = self.options, recording is not None or self.options.watch
         if not is_series:
@@ -165,8 +165,7 @@ class SeriesRun:
     def watch(self, progress: Progress) -> None:
         """Make a volume of each capture that comes, until an interrupt, and print a summary."""
         from ..io.captures import read_images
-        from ..io.recordings import Recording
-        from ..io.watched_folder import WatchedFolder
+        from ..io.recordings import Recording, WatchedFolder
         from ..reconstruction.recording import reconstruct_live
 
         folder, series = self.capture, self._open_series(None)
@@ -214,8 +213,8 @@ class SeriesRun:
     def _open_series(self, names: list[str] | None):
         """Open the volumes of frames of these names, or of captures that are to come."""
         from ..io.names import plain_text
+        from ..io.ngff import VolumeSeries
         from ..io.provenance import input_key
-        from ..io.volume_series import VolumeSeries
 
         provenance = provenance_of(self.plan.weights, *self.camera.files, design=self.design)
         request = _request_of(provenance, names)
@@ -228,7 +227,7 @@ class SeriesRun:
 
     def _write_points(self, path: Path, series) -> str:
         """Write the points of all frames; return their number, and that of particles, as text."""
-        from ..detection.linking import track
+        from ..detection.particles import track
         from ..io.point_tables import write_points_in_time
         from ..io.provenance import INTENSITY
 
@@ -321,7 +320,7 @@ def format_residual(residual) -> str:
 
 def _print_notes(series) -> str:
     """Print how many frames were corrected or have warnings, with the first warning; return the check."""
-    from ..io.volume_series import JOURNAL
+    from ..io.ngff import JOURNAL
 
     done, warned, first, check = 0, 0, "", ""
     for _, note in series.notes():

@@ -170,7 +170,7 @@ def _from_captures(
 ) -> None:
     import numpy as np
 
-    from ..apps.fine_tuning import check_number, fine_tune
+    from ..apps.training import check_number, fine_tune
     from ..design.design import write_design
     from ..geometry import check_beyond
     from ..io.recordings import capture_files

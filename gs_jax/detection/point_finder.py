@@ -1,6 +1,6 @@
 """Finds points in a capture: positions at which nearly all lenses see one. Host code, but for the back-projection.
 
-The paper's particle clustering (`gs_jax.detection.clusters`) needs a volume alone, and finds fewer. Points are rows
+The paper's particle clustering (`gs_jax.detection.particles`) needs a volume alone, and finds fewer. Points are rows
 `(x, y, z, intensity)`, mm; `gs_jax.rasterize` makes a volume of them.
 """
 

@@ -20,7 +20,7 @@ from scipy.special import bdtrc
 from ..base.caches import cache_by_value
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.lens_types import height_bands, split_groups
+from ..optics.apertures import height_bands, split_groups
 from ..optics.psf_core import core_distortion, core_width, type_weights
 from ..optics.raytrace import to_numpy
 from ..typing import Image

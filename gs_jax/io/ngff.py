@@ -1,21 +1,33 @@
-"""Metadata of volumes for viewers: OME-Zarr attributes of volumes (0.4) and of volumes in time (0.5), display range.
+"""OME-Zarr (NGFF): attributes of volumes (0.4) and of volumes in time (0.5), which are written frame by frame.
 
 A volume in time has a file per frame, a shard of Zarr 3; a single volume has one per plane, which readers of Zarr 2
 read too.
+
+The store has its full size from the first frame on, and opens at any moment; frames that are not written read as zeros.
+`frames.jsonl` in it has a line of JSON for the request, then one per frame, appended when the frame is wholly written.
+A last line without its end, which a crash cut off, does not count. A store whose number of frames is not known grows by
+`add`, and its journal also has a line with the name of each frame.
+
+The format is OME-Zarr 0.5 (Zarr 3), whose shards make one file of a frame's planes, written whole or not at all. In 0.4
+each plane is a file: 1.3 million for 10^5 frames of 13 planes, which few file systems of clusters bear.
 """
 
 import itertools
-from collections.abc import Sequence
+import json
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float32
 
-from ..base.errors import input_error, needs_extra
+from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
-from ..typing import Volume
+from ..typing import PathLike, Volume
+from .files import JOURNAL, atomic_write, decoding, disk_errors_name
 from .names import plain_text
-from .provenance import KEY, Provenance
+from .provenance import KEY, Provenance, surface_of
 
 CHUNK = 1024
 # Percentiles of the displayed values, of up to so many rows and columns.
@@ -159,3 +171,262 @@ def frame_shards(shape: tuple[int, int, int, int]) -> dict[str, Any]:
 
 def _square(shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(min(n, CHUNK) for n in shape[-2:])
+
+
+Note = dict[str, Any]
+
+
+class VolumeSeries:
+    """Writes the volumes of a recording; not thread-safe.
+
+    Parameters
+    ----------
+    path
+        Store, ends in `.zarr`. It is made with the first frame, and replaces an image of that name.
+    count, grid
+        Number of frames, None if they are to be added, and the grid of each.
+    interval
+        Seconds between frames, if they are known.
+    request
+        Options that the volumes depend on, as texts, which a resumed run must share.
+    provenance
+        Kept in the store.
+    resume
+        Continue what is there, if anything.
+
+    Raises
+    ------
+    InputError
+        If `resume` finds the store of another recording; on the first frame, if the depths are not in even steps.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        count: int | None,
+        grid: Grid,
+        *,
+        interval: float | None = None,
+        request: dict[str, str] | None = None,
+        provenance: Provenance | None = None,
+        resume: bool = False,
+    ):
+        self.path, self.grid, self.interval = path, grid, interval
+        self._declared, self.count = count, count or 0
+        # Of frames that were added, and how many of them the journal has.
+        self.names: list[str] = []
+        self._journaled = 0
+        self.request, self.provenance = request or {}, provenance or {}
+        self.finished: set[int] = set()
+        self.failed: dict[int, str] = {}
+        self._levels: list[Any] = []
+        if resume and path.exists():
+            self._resume()
+
+    @property
+    def unfinished(self) -> list[int]:
+        """Frames to make, failed ones included."""
+        return [frame for frame in range(self.count) if frame not in self.finished]
+
+    @property
+    def exists(self) -> bool:
+        """Whether the store exists, so that other processes can write volumes by `write_frame`."""
+        return bool(self._levels)
+
+    def add(self, name: str) -> int:
+        """Append a frame of this name, which the journal has with the next volume or failure; return its number."""
+        self.names.append(name)
+        self.count = len(self.names)
+        return self.count - 1
+
+    def write(self, frame: int, volume: Volume | None, note: Note | None = None) -> None:
+        """Write the volume of a frame, counted from 0, then its note to the journal.
+
+        `volume` is None if another process has written it.
+        """
+        if volume is not None:
+            if not self._levels:
+                self._create(volume)
+            self._grow()
+            write_frame(self.path, self._levels, frame, volume)
+        self._append({"frame": frame, **(note or {})})
+        self.finished.add(frame)
+        self.failed.pop(frame, None)
+
+    def fail(self, frame: int, reason: str) -> None:
+        """Record why a frame has no volume."""
+        self.failed[frame] = reason
+        if self._levels:
+            self._grow()
+            self._append({"frame": frame, "error": reason})
+
+    def notes(self) -> Iterator[tuple[int, Note]]:
+        """Yield the finished frames in their order with their notes, which are read one at a time."""
+        if not self._levels:
+            return
+        with open(self.path / JOURNAL, "rb") as file:
+            for frame, offset in sorted(_finished(self.path).items()):
+                file.seek(offset)
+                yield frame, json.loads(file.readline())
+
+    def _append(self, *notes: Note) -> None:
+        journal = self.path / JOURNAL
+        with disk_errors_name(self.path, journal), open(journal, "a", encoding="utf-8", newline="\n") as file:
+            file.write("".join(json.dumps(note) + "\n" for note in notes))
+
+    def _grow(self) -> None:
+        """Make room for the frames that were added, and write their names."""
+        count, first = self.count, self._journaled
+        if self._declared is not None or count == first:
+            return
+        with disk_errors_name(self.path, self.path):
+            for array in self._levels:
+                array.resize((count, *array.shape[1:]))
+        self._append(*({"frame": frame, "name": self.names[frame]} for frame in range(first, count)))
+        self._journaled = count
+
+    def _create(self, volume: Volume) -> None:
+        zarr, shapes = import_zarr(), _pyramid(volume.shape[1:])
+        depths = plain_depths(self.grid)
+        in_time = {"in_time": True, "interval": self.interval}
+        attributes = image_attributes(self.path, depths, self.grid, len(shapes), volume, self.provenance, **in_time)
+        with atomic_write(self.path) as temporary:
+            group = zarr.create_group(store=temporary, zarr_format=3, attributes=attributes)
+            for level, shape in enumerate(shapes):
+                size = (max(self.count, 1), len(depths), *shape)
+                group.create_array(str(level), shape=size, dtype=volume.dtype, **frame_shards(size))
+            lines = [{"request": self.request, "frames": self._declared}]
+            lines += [{"frame": frame, "error": reason} for frame, reason in self.failed.items()]
+            text = "".join(json.dumps(line) + "\n" for line in lines)
+            (temporary / JOURNAL).write_text(text, encoding="utf-8", newline="\n")
+        self._levels = open_levels(self.path, self.grid)
+
+    def _resume(self) -> None:
+        head = _read_head(self.path)
+        if head is None:
+            raise input_error("store for --resume", "what an interrupted recording left", "another store", self.path)
+        now, before = (
+            {**request, "frames": "those of a watched folder" if count is None else str(count)}
+            for request, count in ((self.request, self._declared), head)
+        )
+        for key in dict.fromkeys([*now, *before]):
+            if before.get(key) != now.get(key):
+                given, allowed = (short_repr(options[key]) if key in options else "none" for options in (now, before))
+                raise input_error(f"{key} with --resume", f"{allowed}, as before", given, self.path)
+        journal = self.path / JOURNAL
+        with open(journal, "rb") as file:
+            for note, _ in _lines(file):
+                frame = note["frame"]
+                if "name" in note:
+                    self.names.append(note["name"])
+                elif error := note.get("error", ""):
+                    self.failed[frame] = error
+                else:
+                    self.finished.add(frame)
+                    self.failed.pop(frame, None)
+            whole = file.tell()
+        if self._declared is None:
+            self.count = self._journaled = len(self.names)
+        os.truncate(journal, whole)
+        self._levels = open_levels(self.path, self.grid)
+
+
+def open_levels(path: Path, grid: Grid) -> list[Any]:
+    """Open the arrays of an existing store for writing: the full size, and each next of half its rows and columns."""
+    group = import_zarr().open_group(path, mode="r+")
+    return [group[str(level)] for level in range(len(_pyramid(grid.shape)))]
+
+
+def write_frame(path: Path, levels: list[Any], frame: int, volume: Volume) -> None:
+    """Write the volume of a frame to arrays of `open_levels`: one file each, whole or not at all."""
+    zarr = import_zarr()
+    # Plane by plane, as zarr does otherwise, takes twice as long: each is handed to another thread and waited for.
+    with disk_errors_name(path, path), zarr.config.set({"codec_pipeline.batch_size": len(volume)}):
+        for level, array in enumerate(levels):
+            volume = halve(volume) if level else volume
+            # Left by a process that was killed while it wrote the frame.
+            for partial in (path / str(level) / "c" / str(frame)).rglob("*.partial"):
+                partial.unlink(missing_ok=True)
+            array[frame] = volume
+
+
+def _read_head(path: PathLike) -> tuple[dict[str, str], int | None] | None:
+    """The request of a store and its number of frames, None of one that grows; None without a journal."""
+    try:
+        with open(Path(path) / JOURNAL, encoding="utf-8") as file:
+            head = json.loads(file.readline())
+        count = head["frames"]
+        return {str(key): str(value) for key, value in head["request"].items()}, count and int(count)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+class Series(NamedTuple):
+    """Volumes in time, not yet read.
+
+    `levels` are Zarr arrays `(t, z, y, x)`, the first of the full size; `scale` and `first` its steps and the centre of
+    its first voxel, in um and in seconds (frames, if `interval` is None); `display` is the range of displayed values.
+    """
+
+    levels: list[Any]
+    scale: list[float]
+    first: list[float]
+    interval: float | None
+    display: tuple[float, float]
+
+
+def read_series(path: PathLike) -> Series | None:
+    """Open what `VolumeSeries` wrote; None if it is anything else."""
+    if _read_head(path) is None:
+        return None
+    zarr = import_zarr()
+    with decoding(path, "OME-Zarr"):
+        group = zarr.open_group(path, mode="r")
+        attributes = ngff_attributes(group)
+        (image,), window = attributes["multiscales"], attributes["omero"]["channels"][0]["window"]
+        scale, first = image["datasets"][0]["coordinateTransformations"]
+        interval = scale["scale"][0] if "unit" in image["axes"][0] else None
+        levels = [group[each["path"]] for each in image["datasets"]]
+        time, z, *rest = first["translation"]
+        places = [time, z + um(surface_of(path)), *rest]
+        return Series(levels, scale["scale"], places, interval, (window["start"], window["end"]))
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise `InputError` if the path has an unfinished recording, which `VolumeSeries` would replace."""
+    if (head := _read_head(path)) is None:
+        return
+    done, (_, count) = len(_finished(path)), head
+    if count is None or done < count:
+        watched = f"{done} frame{'s' * (done != 1)} of a watched folder"
+        frames = watched if count is None else f"{done} of {count} frames of an interrupted recording"
+        raise InputError(f"{path}: has {frames}; give --resume to continue it, or --force to replace it.")
+
+
+def _lines(file) -> Iterator[tuple[Note, int]]:
+    """Notes of an open journal and the offsets of their lines; it is left at the end of its last whole line."""
+    file.readline()
+    while (line := file.readline()).endswith(b"\n"):
+        yield json.loads(line), file.tell() - len(line)
+    file.seek(-len(line), os.SEEK_CUR)
+
+
+def _finished(path: Path) -> dict[int, int]:
+    """Frames that have a volume, each with the offset of its last note in the journal of a store."""
+    with open(path / JOURNAL, "rb") as file:
+        return {note["frame"]: offset for note, offset in _lines(file) if not {"error", "name"} & note.keys()}
+
+
+def _pyramid(shape: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Rows and columns of the levels, each half of the last, until one chunk holds a plane."""
+    shapes = [(shape[0], shape[1])]
+    while max(shapes[-1]) > CHUNK:
+        shapes.append((-(-shapes[-1][0] // 2), -(-shapes[-1][1] // 2)))
+    return shapes
+
+
+def halve(volume: Volume) -> Float32[np.ndarray, "depth _ _"]:
+    """Mean of 2 x 2 voxels of each plane; at an odd end, of those that are there."""
+    odd = [(0, 0), *((0, n % 2) for n in volume.shape[1:])]
+    even = np.pad(volume, odd, mode="edge") if volume.shape[1] % 2 or volume.shape[2] % 2 else volume
+    return (even[:, ::2, ::2] + even[:, 1::2, ::2] + even[:, ::2, 1::2] + even[:, 1::2, 1::2]) / np.float32(4)

@@ -20,7 +20,7 @@ from ..base.progress import Progress
 from ..base.workers import map_in_threads
 from ..geometry import Imager, falloff
 from ..grid import Grid
-from .lens_types import split_groups
+from .apertures import split_groups
 from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil, vogel_spiral
 from .raytrace import to_numpy
 

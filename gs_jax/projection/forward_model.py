@@ -17,9 +17,8 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.field_varying import FieldVaryingPsf, field_varying_psf
-from ..optics.lens_types import relative_areas, split_by_type, split_groups
-from ..optics.polar_grid import make_polar_grid
+from ..optics.apertures import relative_areas, split_by_type, split_groups
+from ..optics.field_varying import FieldVaryingPsf, field_varying_psf, make_polar_grid
 from ..optics.psf import PSFS, psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
 from .convolution import sum_of_convolutions, with_margin

@@ -17,8 +17,14 @@ from ..base.machine import cpu_device
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..layers import object_index
-from ..optics.field_varying import CORE_REACH, StrayLight, has_sharp_cores, kernel_size, trace_stray_light
-from ..optics.polar_grid import make_polar_grid
+from ..optics.field_varying import (
+    CORE_REACH,
+    StrayLight,
+    has_sharp_cores,
+    kernel_size,
+    make_polar_grid,
+    trace_stray_light,
+)
 from ..optics.psf_core import PsfCores, render_harmonics, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
 from ..typing import Points

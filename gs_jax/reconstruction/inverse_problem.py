@@ -15,8 +15,8 @@ from ..detection.background import background_tiles, interpolate_tiles
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
+from ..optics.apertures import height_bands, split_groups
 from ..optics.field_varying import FieldVaryingPsf
-from ..optics.lens_types import height_bands, split_groups
 from ..optics.psf_core import core_distortion, type_weights
 from ..projection.forward_model import Optics, PsfModel, check_optics, psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator

@@ -137,7 +137,7 @@ class Plan:
         else:
             volume = self.reconstructor(image, progress)
         if self.suppress == "clusters":
-            from ..detection.clusters import find_clusters
+            from ..detection.particles import find_clusters
 
             with progress.step("Clustering"):
                 points = find_clusters(volume, self.grid)

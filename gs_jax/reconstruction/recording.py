@@ -21,7 +21,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..grid import Grid
-from ..io.volume_series import Note, VolumeSeries, open_levels, write_frame
+from ..io.ngff import Note, VolumeSeries, open_levels, write_frame
 from ..typing import Volume
 
 Frame = TypeVar("Frame")

@@ -20,9 +20,8 @@ from ..grid import Grid, Sensor
 from ..io.point_tables import read_scene_points
 from ..io.volumes import read_volume
 from ..layers import object_index
-from ..optics.field_varying import field_varying_psf
-from ..optics.lens_types import relative_areas, split_groups
-from ..optics.polar_grid import make_polar_grid
+from ..optics.apertures import relative_areas, split_groups
+from ..optics.field_varying import field_varying_psf, make_polar_grid
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import FIDELITIES, forward
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, make_stamps

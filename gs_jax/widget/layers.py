@@ -17,9 +17,8 @@ from ..base.errors import InputError
 from ..base.progress import CancellableProgress
 from ..cli.options import CaptureOptions, depth_range, find_design, parse_depths
 from ..grid import Grid
-from ..io.ngff import display_range
+from ..io.ngff import Series, display_range, read_series
 from ..io.point_tables import POINTS_HEADER, read_points
-from ..io.volume_series import Series, read_series
 from ..io.volumes import VOLUME_SUFFIXES, SurfaceMaps, read_surface, read_volume, surface_mesh
 from ..typing import Points
 
@@ -109,7 +108,7 @@ def newest_captures(folder: Path, make: Callable[[str, Path], Result], progress:
 
     Raises `InputError` if the folder cannot be watched.
     """
-    from ..io.watched_folder import WatchedFolder
+    from ..io.recordings import WatchedFolder
     from ..reconstruction.recording import SETTLED
 
     name, since = "", 0.0
