@@ -32,7 +32,7 @@ from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
 from gs_jax.reconstruction.pipeline import METHODS
-from gs_jax.simulation.phantoms import letters
+from gs_jax.simulation import letters
 
 # Those that come with the package, for 18 to 23 mm; the first defines the exposures.
 DESIGNS = ("geomscope", "geomscope-optimized", "geomscope-asphere")

@@ -18,7 +18,7 @@ from scipy.signal import peak_widths
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax import Design, Grid, Imager, Progress, backproject, read_capture
-from gs_jax.simulation.synthetic import simulate_points
+from gs_jax.simulation import simulate_points
 
 SCENES = {
     "a": [[0.0, 0.0, 20.0, 1.0]],

@@ -27,7 +27,7 @@ from experiments.point_density import scene, scores as density_scores
 from gs_jax.apps.benchmark import timed
 from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.particles import find_clusters
-from gs_jax.simulation.synthetic import simulate_points
+from gs_jax.simulation import simulate_points
 
 # Depths, mm.
 SHOWN = (18.0, 20.0, 22.0)

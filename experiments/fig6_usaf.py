@@ -23,7 +23,7 @@ from experiments.ray_tracer import traced
 from experiments.true_image import bars
 from gs_jax import Camera, Design, Grid, Progress, expose, geomscope, reconstruct
 from gs_jax.apps.pictures import draw_image
-from gs_jax.simulation.synthetic import electrons
+from gs_jax.simulation import electrons
 
 DEPTHS = (18.0, 18.64, 19.27, 19.91, 20.54, 21.18)  # mm, from the paper
 # mm: pitch of voxels and emitters, and the left and upper edges of the groups.

@@ -28,7 +28,7 @@ from experiments.phantoms import snowflake
 from gs_jax.apps.example_pipeline import words
 from gs_jax.apps.pictures import draw_image, label_of
 from gs_jax.detection.unet import pretrained
-from gs_jax.simulation.synthetic import electrons, simulate_points
+from gs_jax.simulation import electrons, simulate_points
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04

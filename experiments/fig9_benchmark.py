@@ -34,7 +34,7 @@ from gs_jax.detection.unet import pretrained
 from gs_jax.optics.theory import FWHM
 from gs_jax.reconstruction.networks import read_unrolled
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
-from gs_jax.simulation.phantoms import letters
+from gs_jax.simulation import letters
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")
 STEPS = 20

@@ -1,6 +1,6 @@
 """Scenes of the paper's figures: fluorescent beads in a slab (Fig. 7), and an inclined snowflake (Fig. 8).
 
-They return emitters, as `gs_jax.simulation.phantoms` does; lengths in mm, angles in radians.
+They return emitters, as `gs_jax.simulation` does; lengths in mm, angles in radians.
 """
 
 import math
@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from gs_jax.layouts import half_size
-from gs_jax.simulation.phantoms import Emitters, as_emitters, uniform_points
+from gs_jax.simulation import Emitters, as_emitters, uniform_points
 
 # Centre lines of a snowflake's arm along +x, of length 1, from and to x + iy.
 _SIDES = np.exp(1j * np.pi / 3 * np.array([1, -1]))

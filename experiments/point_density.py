@@ -22,8 +22,7 @@ import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, local_maxima, main, table
 from gs_jax.detection.background import subtract_background
 from gs_jax.projection.point_sources import full_imager_of_points
-from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.synthetic import simulate_points
+from gs_jax.simulation import random_points, simulate_points
 
 # Numbers of points, and numbers of captures of each.
 SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}

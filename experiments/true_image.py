@@ -30,8 +30,7 @@ from gs_jax.optics.aberrations import best_focus
 from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.projection.point_sources import full_image_of_points
-from gs_jax.simulation.phantoms import letters, random_points
-from gs_jax.simulation.synthetic import simulate_points
+from gs_jax.simulation import letters, random_points, simulate_points
 
 BINS = (1, 4, 16)
 # Captures: electrons per count, and the black level.

@@ -31,7 +31,7 @@ from gs_jax.io.captures import Selection
 from gs_jax.io.ngff import JOURNAL, VolumeSeries
 from gs_jax.io.recordings import open_recording
 from gs_jax.reconstruction.pipeline import voxel_grid
-from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation import random_points
 
 # Seconds between two samples of the process; frames whose parts are timed.
 _EVERY, _TIMED = 0.2, 20

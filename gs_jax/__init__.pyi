@@ -39,8 +39,7 @@ from .reconstruction.pipeline import (
 )
 from .reconstruction.residual import cross_validated as cross_validated, forward_residual as forward_residual
 from .reconstruction.surface_fit import fit_surface as fit_surface
-from .simulation.phantoms import rasterize as rasterize
-from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
+from .simulation import Camera as Camera, expose as expose, rasterize as rasterize, simulate as simulate
 from .solvers.admm import ADMM as ADMM, ConvolutionADMM as ConvolutionADMM
 from .solvers.base import solve as solve
 from .solvers.fista import FISTA as FISTA

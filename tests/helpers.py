@@ -25,7 +25,7 @@ from gs_jax import (
     write_design,
 )
 from gs_jax.projection.rays import trace
-from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation import random_points
 
 from .compilations import compilations as compilations
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gs_jax.simulation.synthetic import Camera, electrons, expose, poisson
+from gs_jax.simulation import Camera, electrons, expose, poisson
 
 KEY = jax.random.key(7)
 draw = jax.jit(poisson)

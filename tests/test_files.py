@@ -27,7 +27,7 @@ from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, check_output, write_json
 from gs_jax.io.point_tables import POINTS_HEADER, read_points, read_positions, read_table, write_points
 from gs_jax.io.volumes import read_volume, write_volume
-from gs_jax.simulation.synthetic import read_scene
+from gs_jax.simulation import read_scene
 
 from .helpers import examples
 

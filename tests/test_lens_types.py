@@ -24,8 +24,7 @@ from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.psf_core import type_weights
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.pipeline import BackProjection, PinholeRichardsonLucy
-from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.synthetic import simulate
+from gs_jax.simulation import random_points, simulate
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 from .test_full import grid, imager, volume

@@ -32,7 +32,7 @@ from gs_jax.optics.psf import PSFS
 from gs_jax.projection.forward_model import FIDELITIES
 from gs_jax.reconstruction.deconvolution import SOLVERS
 from gs_jax.reconstruction.pipeline import METHODS
-from gs_jax.simulation.synthetic import OPTICS
+from gs_jax.simulation import OPTICS
 
 from .test_cli import RECONSTRUCT, folder, run
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from experiments.phantoms import beads, snowflake
 from gs_jax import Grid
-from gs_jax.simulation.phantoms import letters, random_points, rasterize
+from gs_jax.simulation import letters, random_points, rasterize
 
 DEPTHS = (18.0, 18.4, 20.0, 23.0)  # uneven
 

@@ -23,8 +23,7 @@ from gs_jax.detection.view_samples import detection_stats
 from gs_jax.layouts import interleave
 from gs_jax.metrics import localization
 from gs_jax.optics.apertures import clear_area
-from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.synthetic import Camera, expose, simulate, simulate_points
+from gs_jax.simulation import Camera, expose, random_points, simulate, simulate_points
 
 from .helpers import compilations, needs
 

@@ -22,7 +22,7 @@ from gs_jax.optics.psf import psf_of_depth
 from gs_jax.reconstruction.inverse_problem import discrepancy_target, noise_variance, prepare_data, prepare_model
 from gs_jax.reconstruction.pipeline import METHODS, BackProjection, PinholeRichardsonLucy, reconstruct, voxel_grid
 from gs_jax.reconstruction.residual import forward_residual
-from gs_jax.simulation.synthetic import simulate_volume
+from gs_jax.simulation import simulate_volume
 from gs_jax.solvers.base import solve
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, kl_divergence

@@ -9,7 +9,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import PSFS, psf_of_depth
 from gs_jax.optics.pupil import pupil_quadrature
 from gs_jax.optics.raytrace import trace_lenslet
-from gs_jax.simulation.synthetic import simulate, simulate_points, simulate_volume
+from gs_jax.simulation import simulate, simulate_points, simulate_volume
 
 
 def imager(sensor_distance=5.8, pixel=0.01):
@@ -81,7 +81,7 @@ def test_depths_are_taken_some_at_a_time(monkeypatch):
     points = np.column_stack([0 * z, 0 * z, z, np.ones_like(z)])
     options: dict[str, Any] = dict(kind="gaussian")
     whole = simulate_points(points, imager(), **options)
-    monkeypatch.setattr("gs_jax.simulation.synthetic._SLAB", 5)
+    monkeypatch.setattr("gs_jax.simulation._SLAB", 5)
     np.testing.assert_allclose(simulate_points(points, imager(), **options), whole, atol=1e-12 * whole.max())
 
 

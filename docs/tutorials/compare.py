@@ -11,7 +11,7 @@ from matplotlib import pyplot as plt
 
 import gs_jax as gs
 from gs_jax.design.datasheets import datasheet
-from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation import random_points
 
 HALF = 5.0  # half width of the plate and the sensor, mm
 POINTS = 40

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 import gs_jax as gs
-from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation import random_points
 
 PIXELS = 1200  # of each side of the sensor, 7 um each
 POINTS = 25

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 import gs_jax as gs
-from gs_jax.simulation.phantoms import letters
+from gs_jax.simulation import letters
 
 PIXELS = 1280  # of each side of the sensor, 9 um each
 

@@ -16,7 +16,7 @@ from matplotlib import pyplot as plt
 
 import gs_jax as gs
 from gs_jax.io.ngff import read_series
-from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation import random_points
 
 PIXELS = 800  # of each side of the sensor, 9 um each
 FRAMES = 6

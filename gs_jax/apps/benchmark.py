@@ -51,7 +51,7 @@ from ..optics.theory import FWHM
 from ..projection.operators import ImagingOperator
 from ..reconstruction.inverse_problem import subtract_offset
 from ..reconstruction.pipeline import BackProjection, PinholeRichardsonLucy, reconstruct
-from ..simulation.synthetic import Camera, electrons, expose, simulate_points
+from ..simulation import Camera, electrons, expose, simulate_points
 from ..solvers.admm import ADMM
 from ..solvers.base import lambda_max, solve
 from ..solvers.fista import FISTA

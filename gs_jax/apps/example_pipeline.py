@@ -30,8 +30,7 @@ from ..layouts import nearest_neighbour_distances
 from ..metrics import Localization, Quality, localization, quality
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
-from ..simulation.phantoms import letters, random_points, rasterize
-from ..simulation.synthetic import Camera, expose, simulate
+from ..simulation import Camera, expose, letters, random_points, rasterize, simulate
 from ..solvers.admm import ADMM
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled

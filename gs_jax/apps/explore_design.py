@@ -30,7 +30,7 @@ from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions, per_type
 from ..optics.psf import least_samples, spot_image
 from ..optics.raytrace import to_numpy
-from ..simulation.phantoms import random_points
+from ..simulation import random_points
 from .device_model import lenses_that_see
 from .drawings import plate_and_sensor
 

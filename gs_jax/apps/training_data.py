@@ -31,7 +31,7 @@ from ..optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_psf
 from ..optics.psf_core import RINGS, core_distortion
 from ..projection.backprojection import backproject
 from ..projection.forward_model import forward
-from ..simulation.synthetic import Camera, electrons, expose
+from ..simulation import Camera, electrons, expose
 from ..typing import PathLike, Volume
 
 # Planes of a scene; scenes per microscope, whose tables take longer than an image.

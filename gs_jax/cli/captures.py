@@ -220,7 +220,7 @@ def simulate_command(
 
     from ..design.design import read_design
     from ..io.captures import CAPTURE_SUFFIXES, write_capture
-    from ..simulation.synthetic import Camera, expose, read_scene, simulate
+    from ..simulation import Camera, expose, read_scene, simulate
 
     check_outputs(output, CAPTURE_SUFFIXES, inputs=(scene, design))
     if not noise and output.suffix.lower() == ".png":

@@ -304,8 +304,7 @@ def _image_to_compile_for(plan):
     """An image for which all is compiled that captures need: dark, or of points where points are found."""
     if not plan.points and plan.suppress == "none":
         return np.zeros(plan.imager.sensor.shape, np.float32)
-    from ..simulation.phantoms import random_points
-    from ..simulation.synthetic import simulate
+    from ..simulation import random_points, simulate
 
     depths, side = np.asarray(plan.grid.depths, float), float(plan.imager.field_radius)
     points = random_points(10, (side, side), (depths.min(), depths.max()), seed=0)

@@ -161,7 +161,7 @@ class Plan:
         return points, statistics | {"confident": np.full(len(points), int(warning is None))}, warning
 
     def _volume_of_points(self, points: Any) -> Volume:
-        from ..simulation.phantoms import rasterize
+        from ..simulation import rasterize
 
         # Dark points up to a power of two: other numbers of points compile nothing.
         padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))

@@ -165,8 +165,7 @@ def sample() -> list[Any]:
     import jax
 
     from ..design.design import read_design
-    from ..simulation.phantoms import random_points
-    from ..simulation.synthetic import Camera, expose, simulate
+    from ..simulation import Camera, expose, random_points, simulate
 
     imager = read_design(find_design("geomscope")).imager()
     light = simulate(random_points(40, (6.0, 6.0), (18.0, 22.0), seed=0), imager, optics="near", psf="geometric")

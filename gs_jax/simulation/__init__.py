@@ -1,1 +1,0 @@
-"""Scenes, their images, and what a camera makes of them."""
