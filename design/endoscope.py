@@ -6,7 +6,7 @@ The file is in `experiments/designs`.
 from pathlib import Path
 
 from gs_jax.design.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable, write_design
-from gs_jax.layouts import random_layout
+from gs_jax.microscope.layouts import random_layout
 
 STARTS = Path(__file__).parents[1] / "experiments" / "designs"
 SIZE = (4.4, 4.4)

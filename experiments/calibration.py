@@ -31,7 +31,7 @@ from gs_jax.apps.benchmark import markdown_table
 from gs_jax.calibration.calibrated_design import plot_residuals
 from gs_jax.calibration.fit import Calibration, self_calibrate, spot_residuals
 from gs_jax.calibration.spot_model import OF_DEVICE
-from gs_jax.geometry import chief_ray
+from gs_jax.microscope.geometry import chief_ray
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.pipeline import voxel_grid
 

@@ -27,7 +27,7 @@ from gs_jax import Design, Grid, Imager, InputError, Progress, Sensor, geomscope
 from gs_jax.apps.benchmark import markdown_table
 from gs_jax.apps.pictures import PALETTE
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
-from gs_jax.lenses import EACH
+from gs_jax.microscope.lenses import EACH
 
 # Designs that only experiments use.
 DESIGNS = Path(__file__).parent / "designs"

@@ -39,7 +39,7 @@ from experiments.ray_tracer import bundles
 from gs_jax import Design, Imager, Progress, geomscope, quality, random_layout, rasterize, read_design
 from gs_jax.codesign.terms import TERMS
 from gs_jax.io.files import make_folder, write_json
-from gs_jax.layouts import hexagonal_layout
+from gs_jax.microscope.layouts import hexagonal_layout
 from gs_jax.objectives import Conditions
 from gs_jax.reconstruction.inverse_problem import sum_pixels
 

@@ -11,11 +11,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gs_jax.geometry import Imager
-from gs_jax.grid import Grid
+from gs_jax.base.typing import Real
+from gs_jax.microscope.geometry import Imager
+from gs_jax.microscope.grid import Grid
 from gs_jax.projection.backprojection import backproject
 from gs_jax.projection.forward_model import forward
-from gs_jax.typing import Real
 
 Volume = Float[Array | np.ndarray, "depth y x"]
 # Default side of the PSF of a voxel, pixels: three standard deviations of voxels up to 5 pixels wide.

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from gs_jax import Grid, Imager
-from gs_jax.geometry import FALLOFF, field_limit
+from gs_jax.microscope.geometry import FALLOFF, field_limit
 
 ZERO, ONE, TWO, THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 # With any other index type numba allows for negative indices, and does not vectorise.

@@ -24,7 +24,7 @@ from gs_jax.codesign.parameters import new_design
 from gs_jax.codesign.pareto import sweep_of, trade_off
 from gs_jax.codesign.study import Study
 from gs_jax.design.design import design_text
-from gs_jax.geometry import envelope
+from gs_jax.microscope.geometry import envelope
 from gs_jax.optics.apertures import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
 from gs_jax.optics.pupil import pupil_quadrature

@@ -29,8 +29,8 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, half_light_radi
 from experiments.ray_tracer import traced
 from gs_jax import Design, Imager, MicrolensArray, Progress, Sensor, read_capture, read_design
 from gs_jax.calibration.spots import find_spots
-from gs_jax.geometry import envelope
-from gs_jax.layers import layers_in_front, object_index
+from gs_jax.microscope.geometry import envelope
+from gs_jax.microscope.media import layers_in_front, object_index
 from gs_jax.optics.aberrations import best_focus, independent_rms, seidel_of_array, wavefront_rms
 from gs_jax.optics.apertures import aperture_area
 from gs_jax.optics.diffraction import strehl

@@ -9,7 +9,7 @@ from itertools import product
 
 import numpy as np
 
-from gs_jax.layouts import half_size
+from gs_jax.microscope.layouts import half_size
 from gs_jax.simulation import Emitters, as_emitters, uniform_points
 
 # Centre lines of a snowflake's arm along +x, of length 1, from and to x + iy.

@@ -22,8 +22,8 @@ from gs_jax import Imager, MicrolensArray, Progress, Sensor, calibrate, read_cap
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
 from gs_jax.calibration.spots import half_light_radii, mean_shift
-from gs_jax.layouts import nearest_neighbour_distances
-from gs_jax.lenses import lenses_by_type
+from gs_jax.microscope.layouts import nearest_neighbour_distances
+from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.pupil import add_diffraction, aperture_profile, sample_pupil
 

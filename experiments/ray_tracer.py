@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from gs_jax import Imager, InputError
-from gs_jax.lenses import EACH
+from gs_jax.microscope.lenses import EACH
 
 # Parts of a scene, traced by threads, each into its own image.
 PARTS = 4

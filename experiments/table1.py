@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from experiments.common import Report, main, tables_report
 from gs_jax import Design, Progress, geomscope, objectives
 from gs_jax.design.datasheets import datasheet
-from gs_jax.layouts import nearest_neighbour_distances
+from gs_jax.microscope.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 
 COLUMNS = ("what", "paper", "printed: v = 4 mm", "focused: v = 5.8 mm", "why")

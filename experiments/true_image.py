@@ -24,8 +24,8 @@ from scipy.spatial import KDTree
 import gs_jax as gs
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, tables_report
 from experiments.ray_tracer import traced
-from gs_jax.geometry import envelope
-from gs_jax.lenses import Orientation
+from gs_jax.microscope.geometry import envelope
+from gs_jax.microscope.lenses import Orientation
 from gs_jax.optics.aberrations import best_focus
 from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.optics.psf import psf_of_depth

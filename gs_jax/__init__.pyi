@@ -12,17 +12,21 @@ from .design.design import Design as Design, read_design as read_design, write_d
 from .design.start import geomscope as geomscope
 from .detection.point_finder import find_points as find_points
 from .detection.unet import suppress as suppress
-from .geometry import Imager as Imager
-from .grid import Grid as Grid, Sensor as Sensor
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.point_tables import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
-from .layers import Layers as Layers, Sample as Sample
-from .layouts import random_layout as random_layout
-from .lenses import MicrolensArray as MicrolensArray
 from .linear.measured_psf import ConvolutionOperator as ConvolutionOperator
-from .materials import EmissionBand as EmissionBand, refractive_index as refractive_index
 from .metrics import localization as localization, quality as quality
+from .microscope.geometry import Imager as Imager
+from .microscope.grid import Grid as Grid, Sensor as Sensor
+from .microscope.layouts import random_layout as random_layout
+from .microscope.lenses import MicrolensArray as MicrolensArray
+from .microscope.media import (
+    EmissionBand as EmissionBand,
+    Layers as Layers,
+    Sample as Sample,
+    refractive_index as refractive_index,
+)
 from .mold.make import make_mold as make_mold
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward, psf_model as psf_model

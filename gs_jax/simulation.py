@@ -24,18 +24,18 @@ from .base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_f
 from .base.errors import InputError, input_error, short_repr
 from .base.machine import available_memory
 from .base.progress import Progress
-from .geometry import Imager, check_beyond
-from .grid import Grid, Sensor
+from .base.typing import Number, PathLike
 from .io.point_tables import read_scene_points
 from .io.volumes import read_volume
-from .layers import object_index
-from .layouts import check_positive, half_size
+from .microscope.geometry import Imager, check_beyond
+from .microscope.grid import Grid, Sensor
+from .microscope.layouts import check_positive, half_size
+from .microscope.media import object_index
 from .optics.apertures import relative_areas, split_groups
 from .optics.field_varying import field_varying_psf, make_polar_grid
 from .optics.psf import PSFS, psf_of_depth
 from .projection.forward_model import FIDELITIES, forward
 from .projection.point_sources import STEPS, forward_points, full_image_of_points, make_stamps
-from .typing import Number, PathLike
 
 Emitters = Float[np.ndarray, "emitter 4"]
 

@@ -12,8 +12,8 @@ from jax.test_util import check_grads
 from scipy.spatial.distance import cdist
 
 from gs_jax import MicrolensArray
-from gs_jax.layouts import coverage, nearest_neighbour_distances
-from gs_jax.lenses import lenses_by_type
+from gs_jax.microscope.layouts import coverage, nearest_neighbour_distances
+from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.optics.apertures import _edge_distances, aperture_area, clear_area, clear_diameter, pitch
 from gs_jax.optics.pupil import aperture_profile
 

@@ -12,7 +12,7 @@ from experiments.common import write
 from experiments.kernels import count_pairs, lens_patches, paper_loop, plain
 from gs_jax import backproject
 from gs_jax.base.progress import Progress
-from gs_jax.geometry import field_limit
+from gs_jax.microscope.geometry import field_limit
 
 from .helpers import scene
 

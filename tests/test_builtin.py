@@ -5,7 +5,7 @@ import pytest
 
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
-from gs_jax.layouts import coverage, nearest_neighbour_distances
+from gs_jax.microscope.layouts import coverage, nearest_neighbour_distances
 
 ROOT = Path(__file__).parents[1]
 

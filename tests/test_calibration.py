@@ -43,8 +43,8 @@ from gs_jax.io.camera import Readout
 from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
-from gs_jax.layers import reduced_distance
-from gs_jax.lenses import lenses_by_type
+from gs_jax.microscope.lenses import lenses_by_type
+from gs_jax.microscope.media import reduced_distance
 from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.raytrace import to_numpy
 

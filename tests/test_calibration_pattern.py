@@ -27,7 +27,7 @@ from gs_jax.calibration.initial_guess import match_pattern
 from gs_jax.calibration.spots import find_blurred_spots, half_light_radii
 from gs_jax.io.camera import Readout
 from gs_jax.io.captures import read_capture
-from gs_jax.layouts import hexagonal_layout, square_layout
+from gs_jax.microscope.layouts import hexagonal_layout, square_layout
 
 from .helpers import needs
 from .test_calibration import captures, render_spots, traced_spots

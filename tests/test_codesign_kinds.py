@@ -18,8 +18,8 @@ from gs_jax.codesign.terms import _OURS, TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
 from gs_jax.design.start import geomscope
-from gs_jax.layouts import interleave
-from gs_jax.lenses import lenses_by_type
+from gs_jax.microscope.layouts import interleave
+from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.objectives.conditions import per_type
 from gs_jax.optics.apertures import clear_diameter
 

@@ -22,7 +22,7 @@ from gs_jax.codesign.search import problem_of
 from gs_jax.codesign.study import read_study
 from gs_jax.design.design import Design, read_design, write_design
 from gs_jax.design.start import commented, design_keys
-from gs_jax.lenses import lenses_by_type
+from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.optics.raytrace import to_numpy
 
 from .helpers import examples, needs, quantities

@@ -20,7 +20,7 @@ from gs_jax.codesign.linear_error import (
 )
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.design.start import geomscope
-from gs_jax.geometry import Imager
+from gs_jax.microscope.geometry import Imager
 from gs_jax.objectives import Conditions, clear_diameter
 
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))

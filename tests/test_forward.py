@@ -7,7 +7,7 @@ from scipy.signal import fftconvolve
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
 from gs_jax.apps.benchmark import peak_mib
-from gs_jax.geometry import envelope
+from gs_jax.microscope.geometry import envelope
 from gs_jax.optics.psf import gaussian_psf
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.projection.point_sources import STEPS, forward_points, make_stamps

@@ -26,7 +26,7 @@ from gs_jax import (
 )
 from gs_jax.design.design import read_design
 from gs_jax.detection.point_finder import find_points
-from gs_jax.geometry import falloff
+from gs_jax.microscope.geometry import falloff
 from gs_jax.optics import field_varying
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf, make_polar_grid, to_pixels_table

@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from scipy import integrate
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
-from gs_jax.geometry import envelope
+from gs_jax.microscope.geometry import envelope
 from gs_jax.optics.raytrace import trace_lenslet
 
 from .helpers import scene

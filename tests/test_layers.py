@@ -8,7 +8,7 @@ import pytest
 from jax.test_util import check_grads
 
 import gs_jax as gs
-from gs_jax.lenses import Orientation
+from gs_jax.microscope.lenses import Orientation
 from gs_jax.optics import aberrations
 from gs_jax.optics.pupil import solid_angle, transmittance
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.distance import cdist
 
-from gs_jax.layouts import (
+from gs_jax.microscope.layouts import (
     coverage,
     hexagonal_layout,
     lloyd_relax,

@@ -19,7 +19,7 @@ from gs_jax import (
 )
 from gs_jax.detection.background import DetectionImage
 from gs_jax.detection.view_samples import LensType, detection_stats, sample_views, sample_views_by_type
-from gs_jax.lenses import lenses_by_type
+from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.psf_core import type_weights
 from gs_jax.projection.backprojection import backproject

@@ -14,7 +14,7 @@ from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design, checked_design
 from gs_jax.design.start import commented
 from gs_jax.design.tables import Material
-from gs_jax.materials import MATERIALS
+from gs_jax.microscope.media import MATERIALS
 from gs_jax.mold.manufacturability import check_design
 from gs_jax.mold.solids import MoldShape
 

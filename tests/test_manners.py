@@ -21,11 +21,11 @@ from gs_jax.cli.commands import RESUMABLE
 from gs_jax.cli.reconstruct import deconvolve_command
 from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
-from gs_jax.grid import Grid
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
+from gs_jax.microscope.grid import Grid
 from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
 from gs_jax.mold.heights import HEIGHT_SUFFIXES, write_heights
 from gs_jax.optics.psf import PSFS

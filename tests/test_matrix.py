@@ -28,7 +28,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
-from gs_jax.layouts import nearest_neighbour_distances
+from gs_jax.microscope.layouts import nearest_neighbour_distances
 from gs_jax.mold.heights import write_heights
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid

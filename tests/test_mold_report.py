@@ -20,7 +20,7 @@ from gs_jax.design.design import Design, read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.files import checkpoint_path, side_file
 from gs_jax.io.provenance import KEY, read_provenance
-from gs_jax.layouts import coverage
+from gs_jax.microscope.layouts import coverage
 from gs_jax.mold import make
 from gs_jax.mold.lenslets import Part
 from gs_jax.mold.make import draw_preview, make_mold

@@ -14,7 +14,7 @@ from gs_jax.__main__ import commands
 from gs_jax.cli import new_design
 from gs_jax.design.design import Design, design_text, read_design
 from gs_jax.design.start import commented, design_keys, plate_of, radius_of, schema
-from gs_jax.layouts import nearest_neighbour_distances
+from gs_jax.microscope.layouts import nearest_neighbour_distances
 from gs_jax.mold.manufacturability import check_design
 from gs_jax.mold.solids import MoldShape
 

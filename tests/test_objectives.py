@@ -16,9 +16,9 @@ from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.start import geomscope
-from gs_jax.geometry import Imager
-from gs_jax.grid import Sensor
-from gs_jax.layouts import max_gap, nearest_neighbour_distances
+from gs_jax.microscope.geometry import Imager
+from gs_jax.microscope.grid import Sensor
+from gs_jax.microscope.layouts import max_gap, nearest_neighbour_distances
 from gs_jax.objectives import Conditions
 from gs_jax.objectives.quantities import _outermost_half
 from gs_jax.optics.psf import diffraction_psf

@@ -8,7 +8,7 @@ from gs_jax import objectives
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.parameters import NAMES, candidate, evaluated, new_design, start_values
 from gs_jax.design.start import geomscope
-from gs_jax.layouts import coverage
+from gs_jax.microscope.layouts import coverage
 from gs_jax.optics.apertures import clear_diameter, pitch
 
 MOVING = {"centers_mm": (-10.0, 10.0)}

@@ -20,8 +20,8 @@ from gs_jax.design.start import geomscope
 from gs_jax.detection.particles import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.view_samples import detection_stats
-from gs_jax.layouts import interleave
 from gs_jax.metrics import localization
+from gs_jax.microscope.layouts import interleave
 from gs_jax.optics.apertures import clear_area
 from gs_jax.simulation import Camera, expose, random_points, simulate, simulate_points
 

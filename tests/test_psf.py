@@ -6,7 +6,7 @@ from jax.test_util import check_grads
 from scipy.special import j0, j1
 
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.geometry import chief_ray
+from gs_jax.microscope.geometry import chief_ray
 from gs_jax.optics.aberrations import best_focus, wavefront_rms
 from gs_jax.optics.diffraction import strehl
 from gs_jax.optics.psf import _pixel_energy, diffraction_psf, gaussian_psf, geometric_psf

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from scipy.optimize import fminbound
 
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.geometry import chief_ray
+from gs_jax.microscope.geometry import chief_ray
 from gs_jax.optics.aberrations import best_focus, wavefront, wavefront_rms
 from gs_jax.optics.pupil import pupil_quadrature, solid_angle, transmittance
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet

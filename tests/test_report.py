@@ -25,7 +25,7 @@ from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_surface, write_volume
-from gs_jax.layouts import plate_corners
+from gs_jax.microscope.layouts import plate_corners
 from gs_jax.optics.raytrace import trace_lenslet
 
 from .browser import browser, watched

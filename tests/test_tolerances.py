@@ -30,7 +30,7 @@ from gs_jax.apps.tolerances import (
     tolerance,
 )
 from gs_jax.cli.fabrication import tolerance_command as command
-from gs_jax.geometry import envelope
+from gs_jax.microscope.geometry import envelope
 from gs_jax.objectives import Conditions
 from gs_jax.objectives.conditions import field_heights
 from gs_jax.optics import theory

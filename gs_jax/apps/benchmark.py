@@ -35,16 +35,17 @@ from ..base.arrays import to_float32
 from ..base.errors import InputError
 from ..base.machine import available_memory, describe, status_mib
 from ..base.progress import Progress
+from ..base.typing import Volume
 from ..design.start import geomscope
 from ..detection.particles import find_clusters
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
-from ..geometry import Imager
-from ..grid import Grid, Sensor
 from ..io.files import atomic_write, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
-from ..lenses import MicrolensArray
 from ..metrics import localization, quality
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid, Sensor
+from ..microscope.lenses import MicrolensArray
 from ..optics.apertures import clear_diameter
 from ..optics.psf import geometric_psf
 from ..optics.theory import FWHM
@@ -56,7 +57,6 @@ from ..solvers.admm import ADMM
 from ..solvers.base import lambda_max, solve
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
-from ..typing import Volume
 from .pictures import line_of
 
 # 1e6 to 2e9 pairs as in the paper, then up to its full scale (5120^2 pixels times 4 million voxels: 1e14).

@@ -25,6 +25,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Float64, Int, Key
 
 from ..base.errors import InputError
+from ..base.typing import ScalarLike
 from ..calibration.spot_model import (
     FITTED,
     CoreOffsets,
@@ -38,14 +39,13 @@ from ..calibration.spot_model import (
 )
 from ..design.datasheets import parts_of
 from ..design.design import Design
-from ..geometry import Imager
-from ..lenses import MicrolensArray
+from ..microscope.geometry import Imager
+from ..microscope.lenses import MicrolensArray
 from ..objectives.conditions import Conditions, clear_diameter
 from ..objectives.quantities import spot_width
 from ..optics.diffraction import axial_strehl
 from ..optics.raytrace import to_numpy
 from ..optics.theory import FWHM
-from ..typing import ScalarLike
 from .tolerance_spec import ToleranceSpec
 
 # The field of `Errors` that each tolerance sets.

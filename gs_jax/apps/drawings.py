@@ -19,9 +19,9 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from ..base.errors import needs_extra
 from ..design.conversion import default_sample
 from ..design.design import Design
-from ..geometry import Imager
-from ..layers import layers_in_front
-from ..layouts import cell_edges, on_sensor, plate_corners
+from ..microscope.geometry import Imager
+from ..microscope.layouts import cell_edges, on_sensor, plate_corners
+from ..microscope.media import layers_in_front
 from ..mold.lenslets import Part
 from ..optics import theory
 from ..optics.psf import least_samples, spot_image

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from ..base.progress import Progress
+from ..base.typing import PathLike
 from ..codesign.search import run_study
 from ..codesign.search_report import as_records, write_outcome
 from ..design.datasheets import datasheet, findings
@@ -21,20 +22,19 @@ from ..design.design import Design, write_design
 from ..design.start import geomscope
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
-from ..grid import Grid, Sensor
 from ..io.captures import write_capture
 from ..io.files import make_folder, write_figure, write_json, write_text
 from ..io.point_tables import write_points
 from ..io.volumes import write_volume
-from ..layouts import nearest_neighbour_distances
 from ..metrics import Localization, Quality, localization, quality
+from ..microscope.grid import Grid, Sensor
+from ..microscope.layouts import nearest_neighbour_distances
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
 from ..simulation import Camera, expose, letters, random_points, rasterize, simulate
 from ..solvers.admm import ADMM
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
-from ..typing import PathLike
 from .drawings import template
 from .pictures import downsample, draw_image
 from .report import write_report

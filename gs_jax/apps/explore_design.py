@@ -24,9 +24,9 @@ from ..codesign.terms import SIGNS, TERMS, evaluate as evaluate_term
 from ..design.conversion import object_begins
 from ..design.datasheets import SIZES, circle_of_confusion_of, columns_of, lens_and_plate_remarks, spots_remark
 from ..design.design import Design
-from ..geometry import Imager, envelope
-from ..grid import Grid, Sensor
-from ..lenses import lenses_by_type
+from ..microscope.geometry import Imager, envelope
+from ..microscope.grid import Grid, Sensor
+from ..microscope.lenses import lenses_by_type
 from ..objectives.conditions import Conditions, per_type
 from ..optics.psf import least_samples, spot_image
 from ..optics.raytrace import to_numpy

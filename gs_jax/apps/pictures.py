@@ -18,8 +18,8 @@ from matplotlib.image import AxesImage
 from PIL import Image
 
 from ..base.arrays import host_code
-from ..grid import Grid
-from ..typing import Points
+from ..base.typing import Points
+from ..microscope.grid import Grid
 
 # Told apart with any colour vision (M. A. Petroff, arXiv:2107.02270).
 PALETTE = color_sequences["petroff10"]

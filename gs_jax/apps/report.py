@@ -16,17 +16,17 @@ from rich.table import Table
 from ..base.errors import InputError
 from ..base.machine import describe
 from ..base.progress import Progress
+from ..base.typing import Image, PathLike, Points
 from ..design.datasheets import TABLES, datasheet, findings, overview, summary, tables, violations
 from ..design.design import Design, design_text, span_of
-from ..geometry import Imager
-from ..grid import Grid
 from ..io.files import check_output, read_text, write_text
 from ..io.provenance import Provenance
 from ..io.volumes import SurfaceMaps, surface_mesh
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..mold.lenslets import Part
 from ..mold.solids import MoldShape, preview_solid
 from ..optics.raytrace import to_numpy
-from ..typing import Image, PathLike, Points
 from .drawings import (
     Psfs,
     count_lenses,

@@ -16,8 +16,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..design.datasheets import text_table
 from ..design.design import Design
-from ..geometry import Imager, check_beyond
-from ..layouts import check_positive
+from ..microscope.geometry import Imager, check_beyond
+from ..microscope.layouts import check_positive
 from ..objectives.conditions import Conditions
 from ..objectives.quantities import axial_resolution
 from .device_model import (

@@ -23,11 +23,12 @@ from jaxtyping import Array, Float, Float32, PRNGKeyArray
 from ..base.arrays import divide
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.typing import Image, PathLike, Volume
 from ..base.workers import Workers
 from ..detection.unet import UNet, multislice_network, paper_network
-from ..geometry import Imager
-from ..grid import Grid
 from ..io.files import atomic_write, check_input, decoding
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..projection.forward_model import Optics
 from ..projection.operators import ImagingOperator
 from ..reconstruction.inverse_problem import (
@@ -40,7 +41,6 @@ from ..reconstruction.inverse_problem import (
 from ..reconstruction.residual import kept_pixels_of_folds
 from ..solvers.base import Operator, run_solver
 from ..solvers.unrolled import State as UnrolledState, Unrolled, initialize_unrolled
-from ..typing import Image, PathLike, Volume
 from .training_data import (
     Batch,
     CaptureSpec,

@@ -20,19 +20,19 @@ from scipy.ndimage import gaussian_filter
 from ..base.arrays import to_float32
 from ..base.caches import digest_of
 from ..base.progress import Progress
+from ..base.typing import PathLike, Volume
 from ..base.workers import Workers
 from ..detection.unet import standardize
-from ..geometry import Imager
-from ..grid import Grid, Sensor
 from ..io.files import atomic_write, decoding, make_folder
-from ..layouts import hexagonal_layout, poisson_disc_layout, random_layout
-from ..lenses import MicrolensArray
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid, Sensor
+from ..microscope.layouts import hexagonal_layout, poisson_disc_layout, random_layout
+from ..microscope.lenses import MicrolensArray
 from ..optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_psf, make_polar_grid
 from ..optics.psf_core import RINGS, core_distortion
 from ..projection.backprojection import backproject
 from ..projection.forward_model import forward
 from ..simulation import Camera, electrons, expose
-from ..typing import PathLike, Volume
 
 # Planes of a scene; scenes per microscope, whose tables take longer than an image.
 SCENE_PLANES, SCENES = 6, 8

@@ -12,8 +12,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Shaped
 
-from ..typing import Real
 from .errors import InputError, input_error
+from .typing import Real
 
 Tree = TypeVar("Tree")
 Arguments = ParamSpec("Arguments")

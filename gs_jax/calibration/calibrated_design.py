@@ -14,10 +14,10 @@ from ..design.conversion import default_sample, format_medium, layers_of, sample
 from ..design.design import Design
 from ..design.tables import LENS_KEYS
 from ..design.validation import reach
-from ..geometry import Imager
 from ..io.provenance import Provenance
-from ..lenses import EACH, MicrolensArray
-from ..materials import index_of
+from ..microscope.geometry import Imager
+from ..microscope.lenses import EACH, MicrolensArray
+from ..microscope.media import index_of
 from .fit import Calibration
 
 # Length of the longest arrow in the figure, in sides of the sensor.

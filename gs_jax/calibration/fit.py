@@ -17,11 +17,11 @@ from jaxtyping import Float, Float64, Int
 from ..base.arrays import check_finite
 from ..base.errors import InputError, InputWarning
 from ..base.progress import Progress
+from ..base.typing import Image
 from ..detection.point_finder import find_points
-from ..geometry import Imager
-from ..grid import Grid
-from ..lenses import EACH
-from ..typing import Image
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
+from ..microscope.lenses import EACH
 from . import initial_guess as guesses, spot_model as model
 from .initial_guess import MIN_SPOTS, InitialGuess
 from .spot_model import FITTABLE, FITTED, OF_SAMPLE, CoreOffsets, Observations, Unknowns

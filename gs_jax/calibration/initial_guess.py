@@ -19,12 +19,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
+from ..base.typing import Image
 from ..detection.background import subtract_background
-from ..geometry import Imager
-from ..lenses import EACH, MicrolensArray
+from ..microscope.geometry import Imager
+from ..microscope.lenses import EACH, MicrolensArray
 from ..optics.psf_core import FIELDS, ensquared_light
 from ..optics.raytrace import to_numpy
-from ..typing import Image
 from .spot_model import match_radius, trace_core_offsets, with_centers
 from .spots import CaptureFit, Sources, SpotLists, assign_spots, capture_fits
 

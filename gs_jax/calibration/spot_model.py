@@ -20,10 +20,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Float64, Int
 
 from ..base.errors import InputError
-from ..geometry import Imager
-from ..layers import Layers, object_surface
-from ..layouts import nearest_neighbour_distances
-from ..lenses import MicrolensArray, lenses_by_type
+from ..microscope.geometry import Imager
+from ..microscope.layouts import nearest_neighbour_distances
+from ..microscope.lenses import MicrolensArray, lenses_by_type
+from ..microscope.media import Layers, object_surface
 from ..optics.apertures import split_by_type
 from ..optics.pupil import PupilSamples, aperture_profile, sample_pupil
 

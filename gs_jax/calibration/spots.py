@@ -21,11 +21,11 @@ from scipy.spatial import KDTree
 from skimage.feature import peak_local_max
 
 from ..base.errors import InputError
+from ..base.typing import Image
 from ..detection.background import gaussian_smooth, subtract_background
-from ..geometry import Imager
-from ..layouts import nearest_neighbour_distances
+from ..microscope.geometry import Imager
+from ..microscope.layouts import nearest_neighbour_distances
 from ..optics.raytrace import to_numpy
-from ..typing import Image
 from .spot_model import MAX_MOVES, MOVE_TOLERANCE, WINDOW, CoreOffsets, blurred_radius, match_radius, predict_spots
 
 # Sharp spots: half width of the square that the window sees, and distance from the maximum that a middle may have,

@@ -251,8 +251,8 @@ def _placed(scene: Path, objects, grid, light: DepthLight, imager):
     """A scene with depths from the array: a file that says that it counts from the sample was moved when read."""
     import numpy as np
 
-    from ..geometry import check_beyond
     from ..io.provenance import frame_of
+    from ..microscope.geometry import check_beyond
 
     origin, declared = light.origin(imager), frame_of(scene)
     if origin is not None and declared == "array":

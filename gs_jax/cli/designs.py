@@ -36,7 +36,7 @@ def layout_command(
         output: CENTERS.csv, with the header x_mm,y_mm.
     """
     from ..design.tables import write_centers
-    from ..layouts import coverage, nearest_neighbour_distances, random_layout
+    from ..microscope.layouts import coverage, nearest_neighbour_distances, random_layout
 
     check_outputs(output, [".csv"], force=force)
     centers = random_layout(count, size_mm, pitch=pitch_mm, diameter=diameter_mm, seed=seed)
@@ -71,7 +71,7 @@ def metrics_command(
 
     from ..base.progress import VERBOSE, verbosity
     from ..design.datasheets import datasheet, findings, overview, summary, tables
-    from ..geometry import check_beyond
+    from ..microscope.geometry import check_beyond
 
     check_outputs(json, [".json"], inputs=(design,))
     circle_of_confusion = confusion_um and confusion_um / 1000

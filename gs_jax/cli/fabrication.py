@@ -187,10 +187,10 @@ def tolerance_command(
 
     from ..apps.tolerance_spec import read_tolerances
     from ..apps.tolerances import as_json, picture, sentences, tables, tolerance
-    from ..geometry import check_beyond
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
     from ..io.provenance import KEY
+    from ..microscope.geometry import check_beyond
 
     # Single precision would leave errors of micrometres.
     jax.config.update("jax_enable_x64", True)

@@ -332,7 +332,7 @@ class Light(OptionGroup):
 
     def imager(self, design) -> Any:
         """The geometry of a design with these."""
-        from ..layers import Sample
+        from ..microscope.media import Sample
 
         sample = self.sample if self.sample_index is None else Sample(self.sample_index, self.sample_at)
         return design.imager(sample, self.wavelength_nm)
@@ -374,7 +374,7 @@ class DepthLight(Light):
 
     def from_array(self, depths: list[float], imager) -> list[float]:
         """Depths of the command line, counted from the array."""
-        from ..geometry import check_beyond
+        from ..microscope.geometry import check_beyond
 
         origin = self.origin(imager)
         moved = depths if origin is None else [round(depth + origin, 9) for depth in depths]

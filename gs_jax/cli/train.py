@@ -172,8 +172,8 @@ def _from_captures(
 
     from ..apps.training import check_number, fine_tune
     from ..design.design import write_design
-    from ..geometry import check_beyond
     from ..io.recordings import capture_files
+    from ..microscope.geometry import check_beyond
     from ..reconstruction.networks import read_unrolled, write_unrolled
     from ..reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
     from ..reconstruction.radius_fit import fit_radius

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..geometry import Imager, envelope
+from ..microscope.geometry import Imager, envelope
 from ..objectives.conditions import (
     Conditions,
     by_type,

@@ -22,9 +22,9 @@ from pydantic import ValidationError
 from ..base.errors import InputError
 from ..design.design import Design
 from ..design.tables import LENS_KEYS
-from ..geometry import Imager
 from ..io.toml import one_line
-from ..lenses import EACH
+from ..microscope.geometry import Imager
+from ..microscope.lenses import EACH
 from ..objectives.conditions import Conditions
 from ..optics.apertures import pitch
 

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.typing import PathLike
 from ..base.workers import Workers
 from ..design.design import Design
-from ..typing import PathLike
 from .parameters import NAMES, Values, significant, start_values
 from .search import Log, Problem, load, problem_of, run_stages, warn_of_start
 from .study import Row, Study, TermTable

@@ -27,12 +27,12 @@ from jaxtyping import Array, Float, Key
 from ..base.arrays import as_float
 from ..base.errors import InputError, check_kind, errors_name_file
 from ..base.progress import Progress
+from ..base.typing import PathLike
 from ..base.workers import Workers
 from ..design.design import Design, read_design
-from ..geometry import Imager
 from ..io.files import atomic_write, check_input, decoding
+from ..microscope.geometry import Imager
 from ..objectives.conditions import Conditions
-from ..typing import PathLike
 from .parameters import Values, candidate, evaluated, new_design, start_values
 from .solve import (
     NOT_FINITE,

@@ -12,15 +12,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from rich.table import Table
 
+from ..base.typing import PathLike
 from ..design.datasheets import six_digits
 from ..design.design import Design, write_design
 from ..design.validation import of_each
 from ..io.files import side_file, write_figure, write_json
 from ..io.provenance import Provenance
-from ..layouts import plate_corners
-from ..lenses import lenses_by_type
+from ..microscope.layouts import plate_corners
+from ..microscope.lenses import lenses_by_type
 from ..optics.raytrace import to_numpy
-from ..typing import PathLike
 from .parameters import significant
 from .search import Outcome
 from .study import Row, TermTable, labels

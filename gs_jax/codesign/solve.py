@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..base.arrays import as_float, host_code
 from ..base.errors import InputError, InputWarning, check_kind, input_error, short_repr
-from ..geometry import Imager
-from ..layers import check_room
+from ..microscope.geometry import Imager
+from ..microscope.media import check_room
 from .parameters import Free, Values
 from .study import StageTable
 

@@ -28,12 +28,12 @@ from jaxtyping import Array, Float
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from ..base.errors import InputError, short_repr
+from ..base.typing import PathLike
 from ..design.conversion import object_begins, reduced_depth, reduced_sensor_distance, sample_table
 from ..design.design import Design
 from ..io.toml import Table, one_line, read_toml
-from ..layouts import interleave
-from ..lenses import Orientation
-from ..typing import PathLike
+from ..microscope.layouts import interleave
+from ..microscope.lenses import Orientation
 from .parameters import NAMES
 from .terms import GOALS, KINDS, check_term, current_name
 

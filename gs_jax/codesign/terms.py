@@ -22,10 +22,10 @@ from jaxtyping import Array, Float, Key
 from .. import objectives
 from ..base.arrays import as_float
 from ..base.errors import InputError, input_error, short_repr
-from ..geometry import Imager
+from ..base.typing import PathLike, Real
 from ..io.files import check_input, check_suffix
+from ..microscope.geometry import Imager
 from ..objectives.conditions import Conditions
-from ..typing import PathLike, Real
 from .linear_error import volume_error
 
 Built = TypeVar("Built")

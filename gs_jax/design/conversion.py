@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from ..base.errors import InputError, short_repr
-from ..geometry import Imager
-from ..layers import Layers, Sample, layers_in_front, object_surface, reduced_distance
-from ..lenses import lenses_by_type
-from ..materials import EmissionBand, index_of
+from ..microscope.geometry import Imager
+from ..microscope.lenses import lenses_by_type
+from ..microscope.media import EmissionBand, Layers, Sample, index_of, layers_in_front, object_surface, reduced_distance
 from ..optics import theory
 from ..optics.apertures import clear_diameter
 from .tables import ImagingTable, LayerTable, SampleTable

@@ -15,8 +15,8 @@ from rich.table import Table
 
 from .. import objectives
 from ..base.errors import InputError, short_repr
-from ..geometry import Imager
-from ..layouts import check_positive, nearest_neighbour_distances
+from ..microscope.geometry import Imager
+from ..microscope.layouts import check_positive, nearest_neighbour_distances
 from ..objectives.conditions import Conditions, by_type, per_type
 from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory

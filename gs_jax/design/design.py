@@ -12,14 +12,13 @@ import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
-from ..geometry import LONGEST, SHORTEST, Imager
-from ..grid import Sensor
+from ..base.typing import PathLike
 from ..io.files import write_text
 from ..io.toml import Table, one_line, read_toml
-from ..layers import Sample
-from ..lenses import MicrolensArray
-from ..materials import index_of
-from ..typing import PathLike
+from ..microscope.geometry import LONGEST, SHORTEST, Imager
+from ..microscope.grid import Sensor
+from ..microscope.lenses import MicrolensArray
+from ..microscope.media import Sample, index_of
 from .conversion import (
     emission_band,
     format_path,

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from ..base.errors import InputError
 from ..io.toml import table_of
-from ..layouts import PITCH_BY_SPACING, nearest_neighbour_distances, random_layout
+from ..microscope.layouts import PITCH_BY_SPACING, nearest_neighbour_distances, random_layout
 from .design import Design, as_toml
 from .tables import LENS_KEYS, ArrayTable, CentersTable, ImagingTable, LensTable, SensorTable
 from .validation import USUAL, beside_sensor, unit_of

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from pydantic import Field, Tag, ValidationError
 
 from ..base.errors import InputError, errors_name_file
+from ..base.typing import PathLike
 from ..io.names import PIXELS, in_mm, unit_of_name
 from ..io.point_tables import read_columns, write_rows
 from ..io.provenance import Provenance
 from ..io.toml import EACH, NAME, ONE, Table, number_or_name, one_line, one_or_each
-from ..lenses import Orientation
-from ..materials import MATERIALS
-from ..typing import PathLike
+from ..microscope.lenses import Orientation
+from ..microscope.media import MATERIALS
 
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES, _MAX_LINES = 100_000, 100_000

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..lenses import sag_slope_over_r
+from ..microscope.lenses import sag_slope_over_r
 from .conversion import check_band, check_path, object_begins, reduced_depth, reduced_sensor_distance
 from .tables import LENS_KEYS
 

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Float32, Shaped
 
 from ..base.arrays import array_namespace, check_finite
 from ..base.errors import input_error
+from ..base.typing import Image
 from ..base.workers import map_in_threads
-from ..typing import Image
 
 # Side of a tile with one background and one noise level, pixels: wider than a spot, narrower than haze. A band has as
 # many rows.

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Float64
 from skimage.measure import label, regionprops
 
 from ..base.errors import InputError, needs_extra
-from ..grid import Grid
-from ..typing import Number
+from ..base.typing import Number
+from ..microscope.grid import Grid
 
 # Standard deviation of a normal distribution over its median absolute deviation.
 _DEVIATION = 1.4826

@@ -17,11 +17,11 @@ from scipy.ndimage import map_coordinates
 from ..base.arrays import host_code, jit
 from ..base.errors import InputError, check_kind
 from ..base.progress import Progress
-from ..geometry import Imager, check_beyond
-from ..grid import Grid
+from ..base.typing import Image
+from ..microscope.geometry import Imager, check_beyond
+from ..microscope.grid import Grid
 from ..optics.psf_core import FIELDS, HALF_SIDE, core_width, ensquared_light, warn_if_blurred
 from ..projection.backprojection import backproject
-from ..typing import Image
 from .background import DetectionImage, Pixels, filter_bands, subtract_background
 from .view_samples import (
     COARSE,

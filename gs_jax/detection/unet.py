@@ -14,10 +14,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, short_repr
+from ..base.typing import PathLike, Volume
 from ..base.weights import load_weights, save_weights, shipped_weights
 from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import Provenance
-from ..typing import PathLike, Volume
 from .background import mirror_indices
 
 # Networks that ship with the package, and limits of what a file of weights may hold.

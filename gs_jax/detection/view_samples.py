@@ -18,12 +18,12 @@ from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from ..base.caches import cache_by_value
-from ..geometry import Imager
-from ..grid import Grid
+from ..base.typing import Image
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..optics.apertures import height_bands, split_groups
 from ..optics.psf_core import core_distortion, core_width, type_weights
 from ..optics.raytrace import to_numpy
-from ..typing import Image
 from .background import DetectionImage, Pixels, subsample, subtract_background
 
 # Share of its lenses that must see a point; the others may be blocked, scratched, or under a brighter point.

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, Shaped
 
 from ..base.errors import InputError, errors_name_file, input_error
-from ..grid import Sensor
-from ..typing import PathLike
+from ..base.typing import PathLike
+from ..microscope.grid import Sensor
 from .captures import DTYPES, REPEATS, Selection, average, mosaic_channel, mosaic_sites, read_images, size_text
 
 # Pixels of the flat field below this share of its median are bad.

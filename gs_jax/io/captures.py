@@ -19,7 +19,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
-from ..typing import PathLike
+from ..base.typing import PathLike
 from .axes import UNNAMED, stack_axis, stack_error
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .provenance import KEY, Provenance, write_sidecar

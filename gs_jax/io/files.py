@@ -20,7 +20,7 @@ from typing import Any
 
 from ..base.errors import InputError, input_error, short_repr
 
-# Not from `gs_jax.typing`, which imports JAX: the help of commands does without.
+# Not from `gs_jax.base.typing`, which imports JAX: the help of commands does without.
 PathLike = str | os.PathLike[str]
 
 TIFF_SUFFIXES = (".tif", ".tiff")

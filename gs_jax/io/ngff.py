@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..base.errors import InputError, input_error, needs_extra, short_repr
-from ..grid import Grid
-from ..typing import PathLike, Volume
+from ..base.typing import PathLike, Volume
+from ..microscope.grid import Grid
 from .files import JOURNAL, atomic_write, decoding, disk_errors_name
 from .names import plain_text
 from .provenance import KEY, Provenance, surface_of

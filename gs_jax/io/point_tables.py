@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int, Shaped
 
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
-from ..typing import PathLike, Points
+from ..base.typing import PathLike, Points
 from .files import MAX_TEXT_BYTES, atomic_write, check_output, read_text
 from .provenance import SURFACE, Provenance, write_sidecar
 

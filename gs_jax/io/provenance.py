@@ -22,8 +22,8 @@ from PIL import Image
 
 from .._version import __version__
 from ..base.errors import input_error
-from ..grid import Grid
-from ..typing import PathLike
+from ..base.typing import PathLike
+from ..microscope.grid import Grid
 from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, side_file, write_json
 from .names import plain_text
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.errors import InputError, InputWarning, needs_extra
-from ..typing import PathLike
+from ..base.typing import PathLike
 from .axes import UNNAMED, axis_letter, stack_error
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
 from .captures import (

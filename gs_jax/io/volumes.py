@@ -24,8 +24,8 @@ from jaxtyping import Array, Float, Float32, Int, Shaped
 
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
-from ..grid import Grid
-from ..typing import PathLike, Volume
+from ..base.typing import PathLike, Volume
+from ..microscope.grid import Grid
 from .captures import write_npy
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .names import mm_per

@@ -24,10 +24,10 @@ from trimesh.exchange.stl import export_stl
 
 from .._version import __version__
 from ..base.errors import InputError, needs_extra
+from ..base.typing import PathLike
 from ..io.files import atomic_write, check_input, check_output, check_suffix, decoding
 from ..io.provenance import KEY, Provenance, write_sidecar
-from ..lenses import MicrolensArray
-from ..typing import PathLike
+from ..microscope.lenses import MicrolensArray
 from .lenslets import Part
 from .solids import MoldShape, alignment_marks, mold_bounds
 

@@ -25,11 +25,11 @@ from PIL import Image, PngImagePlugin
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
+from ..base.typing import PathLike
 from ..design.conversion import AIR
 from ..design.design import Design
 from ..io.files import atomic_write, check_output, decoding, write_json
 from ..io.provenance import KEY, Provenance, sidecar
-from ..typing import PathLike
 from .lenslets import Part
 from .manufacturability import check_design, open_design, raise_first_error
 from .solids import MoldShape

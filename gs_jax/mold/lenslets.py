@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.integrate import cumulative_simpson
 from scipy.spatial import Delaunay, KDTree
 
-from ..lenses import EACH, MicrolensArray, sag, sag_slope_over_r
+from ..microscope.lenses import EACH, MicrolensArray, sag, sag_slope_over_r
 
 # Draft of the walls: lets a cast be peeled, and joins walls that touch into one body.
 DRAFT = math.radians(5)

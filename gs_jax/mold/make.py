@@ -13,11 +13,11 @@ from matplotlib.ticker import MaxNLocator
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.typing import PathLike
 from ..design.conversion import AIR
 from ..design.design import Design
 from ..io.files import atomic_write, check_output, side_file, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
-from ..typing import PathLike
 from .export import MESH_SUFFIXES, check_mesh_reader, float32_mesh, read_mesh, write_mesh
 from .lenslets import Part
 from .manufacturability import CheckResult, check_design, check_solid, open_design, raise_first_error

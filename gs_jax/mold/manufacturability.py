@@ -13,10 +13,10 @@ import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
+from ..base.typing import PathLike
 from ..design.conversion import AIR
 from ..design.design import Design, read_design
-from ..layouts import cell_edges, coverage, max_gap
-from ..typing import PathLike
+from ..microscope.layouts import cell_edges, coverage, max_gap
 from .export import Mesh
 from .lenslets import MAX_SLOPE, Part, surface_height
 from .solids import MAX_FACETS, VOLUME_TOLERANCE, MoldShape, aperture_fault

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry import Imager
+from ..microscope.geometry import Imager
 from .export import Mesh
 from .lenslets import NODES, WEIGHTS, Lenslet, Part, surface_height
 

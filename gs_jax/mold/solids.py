@@ -19,7 +19,7 @@ from matplotlib.textpath import TextPath
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..layouts import ROUNDING, cell_edges, half_size, in_mm, nearest_neighbour_distances
+from ..microscope.layouts import ROUNDING, cell_edges, half_size, in_mm, nearest_neighbour_distances
 from .lenslets import DRAFT, Lenslet, Part, tessellate
 
 ENGRAVING_DEPTH = 0.4

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields, safe_sqrt
 from ..base.errors import check_kind, input_error, short_repr
-from ..geometry import Imager
+from ..microscope.geometry import Imager
 from ..optics.apertures import clear_diameter as diameter_of, clear_diameters
 
 # Heights over the field at which a lens is evaluated.

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..geometry import Imager, envelope
-from ..layers import object_index
+from ..microscope.geometry import Imager, envelope
+from ..microscope.media import object_index
 from ..optics import aberrations, theory
 from ..optics.diffraction import AxialPupil, axial_irradiance, axial_pupil
 from ..optics.pupil import pupil_quadrature

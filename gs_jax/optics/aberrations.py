@@ -30,9 +30,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import jit, safe_quotient, safe_sqrt
-from ..geometry import Imager
-from ..lenses import MicrolensArray
-from ..typing import Real, Result, ScalarLike
+from ..base.typing import Real, Result, ScalarLike
+from ..microscope.geometry import Imager
+from ..microscope.lenses import MicrolensArray
 from .pupil import pupil_quadrature, pupil_radius
 from .raytrace import Point, chief_ray_length, direction_cosines, trace_lenslet
 

@@ -4,7 +4,7 @@ The array's surface is the upper envelope of the lenses' surfaces: a lens ends w
 identical lenses the clear aperture is the Voronoi cell, within the disc of `aperture_diameter` and within the plate.
 Seen from the vertex it is star-shaped: its edge is one distance in each direction. Where lenses differ, edges are
 curved: projections of the circles in which two spheres meet. A flat lens may reappear behind a steep neighbour; that
-part is not counted. `gs_jax.layouts` has areas and distances on the host.
+part is not counted. `gs_jax.microscope.layouts` has areas and distances on the host.
 
 Images are linear in the lenses: the image of an array is the sum of the images by each type of lens, whose lenses are
 identical. The lenses of a tilted array differ in their distance from the sensor: they are divided into bands of height,
@@ -24,8 +24,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Float64, Int
 
 from ..base.arrays import jit, one_program, safe_sqrt
-from ..geometry import Imager
-from ..lenses import EACH, MicrolensArray, sag
+from ..microscope.geometry import Imager
+from ..microscope.lenses import EACH, MicrolensArray, sag
 from .raytrace import to_numpy
 
 # Lenses computed at once, and neighbours that may bound a lens. A cell of a random layout has six on average.

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..base.arrays import jit
-from ..geometry import Imager
+from ..base.typing import ScalarLike
 from ..linear.fourier import phasor
-from ..typing import ScalarLike
+from ..microscope.geometry import Imager
 from .pupil import pupil_quadrature, pupil_radius
 from .raytrace import Point, chief_ray_length, direction_cosines, trace_lenslet
 

@@ -24,8 +24,8 @@ from ..base.caches import cache_by_value, cached_on_disk
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..base.workers import map_in_threads
-from ..geometry import Imager
 from ..linear.sparse_table import SparseTable
+from ..microscope.geometry import Imager
 from .apertures import clear_area
 from .psf_core import (
     HARMONICS,

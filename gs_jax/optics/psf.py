@@ -2,7 +2,7 @@
 
 `diffraction_psf` is scalar diffraction with the exact wavefront, `geometric_psf` counts rays, `gaussian_psf` is a
 Gaussian with the moments of the rays. Each returns `(size, size)` pixels `[row, column]` with the sum 1, centred on the
-chief ray of `gs_jax.geometry`: what that map leaves out (distortion, coma) is in the PSF. `spot_image` takes
+chief ray of `gs_jax.microscope.geometry`: what that map leaves out (distortion, coma) is in the PSF. `spot_image` takes
 diffraction or rays, whichever the width of the spot asks for.
 """
 
@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import jit
 from ..base.errors import InputError
-from ..geometry import Imager, chief_ray
-from ..typing import Scalar, ScalarLike
+from ..base.typing import Scalar, ScalarLike
+from ..microscope.geometry import Imager, chief_ray
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
 from .pupil import emission_lines, pupil_quadrature, pupil_radius, vogel_spiral
@@ -279,7 +279,7 @@ def _pixel_energy(imager, depth, size, field, offset, radius, edges, samples) ->
 
 
 def _chief_landing(imager: Imager, depth, field, dtype) -> Array:
-    """Where `gs_jax.geometry` has the chief ray land, from the lens's axis."""
+    """Where `gs_jax.microscope.geometry` has the chief ray land, from the lens's axis."""
     magnification = imager.magnification(jnp.asarray(depth, dtype))
     return chief_ray(jnp.zeros(2, dtype), jnp.asarray(field, dtype), magnification)
 

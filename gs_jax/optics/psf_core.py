@@ -18,8 +18,8 @@ from ..base.caches import cache_by_value
 from ..base.errors import InputWarning
 from ..base.progress import Progress
 from ..base.workers import map_in_threads
-from ..geometry import Imager, falloff
-from ..grid import Grid
+from ..microscope.geometry import Imager, falloff
+from ..microscope.grid import Grid
 from .apertures import split_groups
 from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil, vogel_spiral
 from .raytrace import to_numpy

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from ..base.arrays import array_namespace, one_program
-from ..geometry import Imager
-from ..layers import object_indices
-from ..lenses import EACH, MicrolensArray, sag
-from ..typing import Coordinates, Scalar, ScalarLike, Scalars
+from ..base.typing import Coordinates, Scalar, ScalarLike, Scalars
+from ..microscope.geometry import Imager
+from ..microscope.lenses import EACH, MicrolensArray, sag
+from ..microscope.media import object_indices
 from .apertures import clear_area
 from .raytrace import RefractedRay, dot, refract, secant, square_and_root, to_numpy
 from .theory import airy_sigma

@@ -22,10 +22,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..base.arrays import array_namespace, jit
-from ..geometry import Imager, chief_ray
-from ..layers import object_slabs
-from ..lenses import MicrolensArray
-from ..typing import Coordinates, Scalar, ScalarLike, Scalars
+from ..base.typing import Coordinates, Scalar, ScalarLike, Scalars
+from ..microscope.geometry import Imager, chief_ray
+from ..microscope.lenses import MicrolensArray
+from ..microscope.media import object_slabs
 
 Point = Float[Array | np.ndarray, "2"] | tuple[ScalarLike, ScalarLike]
 Module = TypeVar("Module", Imager, MicrolensArray)

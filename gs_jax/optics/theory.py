@@ -11,7 +11,7 @@ import math
 import jax.numpy as jnp
 
 from ..base.arrays import safe_quotient, safe_sqrt
-from ..typing import Real, Result
+from ..base.typing import Real, Result
 
 # Full width at half maximum of a Gaussian, in standard deviations.
 FWHM = math.sqrt(8 * math.log(2))

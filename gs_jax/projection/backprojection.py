@@ -10,9 +10,9 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Num
 
 from ..base.arrays import check_real, jit
-from ..geometry import Imager
-from ..grid import Grid
-from ..typing import Image
+from ..base.typing import Image
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from .bilinear import Shapes, image_to_volume, volume_to_image
 from .rays import Rays, trace
 

@@ -12,10 +12,10 @@ import numpy as np
 from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager
-from ..grid import Sensor
 from ..linear.fourier import fast_length, kernel_spectrum
 from ..linear.linear_map import LinearMap
+from ..microscope.geometry import Imager
+from ..microscope.grid import Sensor
 from .cpu.loading import kernels
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager, field_limit
-from ..grid import Grid, Sensor
 from ..linear.fourier import upsample_by_two
+from ..microscope.geometry import Imager, field_limit
+from ..microscope.grid import Grid, Sensor
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.psf_core import ring_edges
 from .bilinear import Shapes, volume_to_image

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Num
 from ..base.arrays import as_float, host_code, jit
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
-from ..geometry import Imager
-from ..grid import Grid
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..optics.apertures import relative_areas, split_by_type, split_groups
 from ..optics.field_varying import FieldVaryingPsf, field_varying_psf, make_polar_grid
 from ..optics.psf import PSFS, psf_of_depth

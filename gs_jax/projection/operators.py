@@ -5,9 +5,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from ..geometry import Imager
-from ..grid import Grid
 from ..linear.matrix_free import MatrixFree
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from .backprojection import backproject
 from .forward_model import Optics, check_optics, forward, psf_model
 

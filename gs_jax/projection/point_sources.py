@@ -15,8 +15,9 @@ from scipy.spatial import KDTree
 
 from ..base.machine import cpu_device
 from ..base.progress import Progress
-from ..geometry import Imager
-from ..layers import object_index
+from ..base.typing import Points
+from ..microscope.geometry import Imager
+from ..microscope.media import object_index
 from ..optics.field_varying import (
     CORE_REACH,
     StrayLight,
@@ -27,7 +28,6 @@ from ..optics.field_varying import (
 )
 from ..optics.psf_core import PsfCores, render_harmonics, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
-from ..typing import Points
 from .rays import Envelope, RingLight
 from .stray_light import stray_light_image
 

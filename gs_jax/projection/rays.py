@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..geometry import Imager, chief_ray, envelope, field_limit
-from ..grid import Grid
+from ..base.typing import Scalar
+from ..microscope.geometry import Imager, chief_ray, envelope, field_limit
+from ..microscope.grid import Grid
 from ..optics.psf_core import ring_light
-from ..typing import Scalar
 
 # Squared distance, mm^2, added for rays off the sensor: outside the field of every lens, where the envelope and all
 # its derivatives vanish.

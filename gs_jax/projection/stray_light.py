@@ -15,9 +15,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..base.arrays import array_namespace
-from ..geometry import Imager
 from ..linear.linear_map import LinearMap
 from ..linear.sparse_table import times_entries
+from ..microscope.geometry import Imager
 from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
 from .cpu.loading import kernels

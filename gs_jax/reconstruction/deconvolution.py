@@ -15,12 +15,12 @@ from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
+from ..base.typing import Image
 from ..linear.measured_psf import ConvolutionOperator, FieldConvolutionOperator, middle, scene_size
 from ..solvers.admm import ADMM, ConvolutionADMM
 from ..solvers.base import estimate_of, run_solver
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
-from ..typing import Image
 from .inverse_problem import binned_variance, discrepancy_target, subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR
 

@@ -11,16 +11,16 @@ from jaxtyping import Array, Float, Float64, Shaped
 
 from ..base.arrays import array_namespace, check_finite, is_traced, native
 from ..base.progress import Progress
+from ..base.typing import Image
 from ..detection.background import background_tiles, interpolate_tiles
-from ..geometry import Imager
-from ..grid import Grid
 from ..io.camera import Readout
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..optics.apertures import height_bands, split_groups
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.psf_core import core_distortion, type_weights
 from ..projection.forward_model import Optics, PsfModel, check_optics, psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
-from ..typing import Image
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARK_PERCENTILE = 1

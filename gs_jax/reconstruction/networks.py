@@ -1,10 +1,10 @@
 """Files of the unrolled inversion's networks, which `gs-jax train` writes."""
 
+from ..base.typing import PathLike
 from ..base.weights import load_weights, save_weights
 from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import Provenance
 from ..solvers.unrolled import Unrolled, unrolled_skeleton
-from ..typing import PathLike
 
 
 def write_unrolled(path: PathLike, networks: Unrolled, provenance: Provenance | None = None) -> None:

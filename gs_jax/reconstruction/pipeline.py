@@ -14,8 +14,9 @@ from ..base.arrays import array_namespace, check_finite, check_real, divide, hos
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..geometry import Imager, check_beyond
-from ..grid import Grid
+from ..base.typing import Image, Volume
+from ..microscope.geometry import Imager, check_beyond
+from ..microscope.grid import Grid
 from ..optics.psf_core import warn_if_blurred
 from ..projection.backprojection import backproject, backproject_on_all_devices
 from ..projection.forward_model import FIDELITIES, Optics, check_optics
@@ -25,7 +26,6 @@ from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
-from ..typing import Image, Volume
 from .inverse_problem import (
     InverseProblem,
     LensTypeGeometry,

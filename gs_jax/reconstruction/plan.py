@@ -10,13 +10,13 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..geometry import Imager
-from ..grid import Grid
+from ..base.typing import Image, Volume
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..optics.psf_core import blur_warning, sharpness
 from ..solvers.richardson_lucy import State as LucyState, restarted
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
-from ..typing import Image, Volume
 from .networks import read_unrolled
 from .pipeline import METHODS, PIXELS_PER_VOXEL, STEPPED, Method, Reconstructor, method_by_name, voxel_grid
 from .residual import CrossValidation, ForwardResidual, cross_validated, forward_residual

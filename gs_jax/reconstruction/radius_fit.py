@@ -16,10 +16,10 @@ import numpy as np
 
 from ..base.errors import InputError, InputWarning
 from ..base.progress import Progress
-from ..geometry import Imager, field_limit
-from ..grid import Grid
+from ..base.typing import Image
 from ..io.camera import Readout
-from ..typing import Image
+from ..microscope.geometry import Imager, field_limit
+from ..microscope.grid import Grid
 from .inverse_problem import prepare_model, sum_pixels
 from .pipeline import Method, Reconstructor
 from .residual import check_scored, kept_pixels_of_folds, light_of, relative, residual_of

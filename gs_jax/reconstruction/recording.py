@@ -19,10 +19,10 @@ from typing import Any, NamedTuple, TypeVar
 from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.typing import Volume
 from ..base.workers import Workers
-from ..grid import Grid
 from ..io.ngff import Note, VolumeSeries, open_levels, write_frame
-from ..typing import Volume
+from ..microscope.grid import Grid
 
 Frame = TypeVar("Frame")
 # From a frame, and what the last one left for it, to a volume, a note, and what it leaves for the next one.

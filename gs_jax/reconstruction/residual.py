@@ -10,11 +10,11 @@ from jaxtyping import Array, Float, Int
 from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
-from ..geometry import Imager
-from ..grid import Grid
+from ..base.typing import Image, Volume
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..projection.forward_model import Optics, forward
 from ..solvers.surface import Surface
-from ..typing import Image, Volume
 from .inverse_problem import InverseProblem, binned_variance, prepare_data, prepare_model
 from .pipeline import BackProjection, Method, Reconstructor, check_call, check_stop
 

@@ -9,12 +9,12 @@ from jaxtyping import Float32
 from ..base.arrays import host_code
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
-from ..geometry import Imager
-from ..grid import Grid
+from ..base.typing import Image, Volume
+from ..microscope.geometry import Imager
+from ..microscope.grid import Grid
 from ..projection.forward_model import Optics
 from ..solvers.base import estimate_of
 from ..solvers.surface import RESTARTED_STEPS, State, Surface, depth_of_sheets, restarted
-from ..typing import Image, Volume
 from .pipeline import Reconstructor, check_call
 
 # Columns of less light, of the 99th percentile, have no depth.

@@ -28,8 +28,8 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
+from ..base.typing import Image, Real
 from ..linear.measured_psf import ConvolutionOperator
-from ..typing import Image, Real
 from .base import (
     Operator,
     as_image,

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide
-from ..typing import Real
+from ..base.typing import Real
 from .base import Operator, as_image, check_options, lambda_max, norm
 
 # Steps of Lanczos' method find the largest eigenvalue to about a percent; the margin covers the rest.

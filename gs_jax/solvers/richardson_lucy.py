@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide
 from ..base.errors import InputError
-from ..typing import Real
+from ..base.typing import Real
 from .base import (
     Operator,
     as_image,

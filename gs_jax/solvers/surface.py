@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
-from ..typing import Real
+from ..base.typing import Real
 from .base import Operator, as_image, check_options, differences, differences_adjoint, magnitude
 from .richardson_lucy import (
     BACKGROUND_KNOTS,

@@ -15,12 +15,12 @@ from jaxtyping import Num
 
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress
+from ..base.typing import Points
 from ..cli.options import CaptureOptions, depth_range, find_design, parse_depths
-from ..grid import Grid
 from ..io.ngff import Series, display_range, read_series
 from ..io.point_tables import POINTS_HEADER, read_points
 from ..io.volumes import VOLUME_SUFFIXES, SurfaceMaps, read_surface, read_volume, surface_mesh
-from ..typing import Points
+from ..microscope.grid import Grid
 
 # Seconds between looks whether the user cancelled.
 _POLL_INTERVAL = 0.1

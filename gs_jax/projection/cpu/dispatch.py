@@ -18,8 +18,8 @@ from jax import ShapeDtypeStruct
 from numba import cfunc, types
 from numba.core.caching import FunctionCache
 
-from ...geometry import FALLOFF, field_limit
 from ...linear.fourier import kernel_spectrum
+from ...microscope.geometry import FALLOFF, field_limit
 from ..rays import Envelope, Rays
 from . import ffi, fftconv, kernels, windows
 from .simd import FAST, WIDTH

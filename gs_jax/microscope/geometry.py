@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .base.arrays import (
+from ..base.arrays import (
     FINITE,
     POSITIVE,
     Rule,
@@ -26,9 +26,12 @@ from .base.arrays import (
     native,
     one_program,
 )
-from .base.errors import input_error
+from ..base.errors import input_error
+from ..base.typing import Scalar, Scalars
 from .grid import Sensor
-from .layers import (
+from .lenses import MicrolensArray
+from .media import (
+    EmissionBand,
     Layers,
     Sample,
     check_room,
@@ -39,9 +42,6 @@ from .layers import (
     tilted_index,
     tilted_shortening,
 )
-from .lenses import MicrolensArray
-from .materials import EmissionBand
-from .typing import Scalar, Scalars
 
 # Limits of the wavelength, mm: others are in another unit.
 SHORTEST, LONGEST = 1e-5, 0.1
@@ -253,7 +253,8 @@ class Imager(eqx.Module):
         """Reduced depth `z'` from the object to the lens vertices, mm.
 
         It is `z + t/n` with the plate in front, and `z` with the curved side in front; filters and the sample change
-        it as `gs_jax.layers` says. An imager of NumPy's numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
+        it as `gs_jax.microscope.media` says. An imager of NumPy's numbers (`gs_jax.optics.raytrace.to_numpy`) gives
+        NumPy's.
         """
         depth = array_namespace(self.sensor_distance).asarray(native(depth))
         return reduced_distance(depth, self.filters, self.sample) + self.array.reduced_thickness_front

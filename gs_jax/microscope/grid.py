@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from .base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields, native, one_program
+from ..base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields, native, one_program
 
 
 class Sensor(eqx.Module):

@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .base.arrays import (
+from ..base.arrays import (
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
@@ -23,8 +23,8 @@ from .base.arrays import (
     check_fields,
     one_program,
 )
-from .base.errors import InputError
-from .typing import Scalar, Scalars
+from ..base.errors import InputError
+from ..base.typing import Scalar, Scalars
 
 # The side of the lenses that faces the object.
 Orientation = Literal["plano", "curved"]

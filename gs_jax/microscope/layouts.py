@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import Delaunay, KDTree, Voronoi
 
-from .base.errors import InputError
+from ..base.errors import InputError
+from ..base.typing import Number
 from .geometry import Imager
-from .typing import Number
 
 # A position in single precision: a lens on the plate's edge is on the plate.
 ROUNDING = 1e-6
