@@ -96,9 +96,7 @@ def test_the_physics_knows_no_files_and_solvers_no_microscope():
     physics = imports_of("microscope", "optics", "objectives", "projection")
     assert not {(module, other) for module, other in physics if other in ("io", "design", "simulation")}
     of_solvers = {
-        (module, other)
-        for module, other in imports_of("solvers")
-        if other not in ("base", "linear", "solvers")
+        (module, other) for module, other in imports_of("solvers") if other not in ("base", "linear", "solvers")
     }
     assert not of_solvers
 
