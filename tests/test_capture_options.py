@@ -11,7 +11,7 @@ from gs_jax.design.design import read_design
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.volumes import read_volume
 
-from .test_cli import DESIGN
+from .helpers import DESIGN
 
 SHAPE = (96, 80)
 LIGHT = np.random.default_rng(0).integers(100, 3000, SHAPE)

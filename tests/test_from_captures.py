@@ -14,7 +14,7 @@ from gs_jax.reconstruction.networks import read_unrolled, write_unrolled
 from gs_jax.reconstruction.radius_fit import RadiusFit, with_radii
 from gs_jax.solvers.unrolled import initialize_unrolled
 
-from .test_cli import DESIGN
+from .helpers import DESIGN
 from .test_cross_validation import GRID, exposed, scope
 
 

@@ -12,8 +12,6 @@ from gs_jax.calibration.calibrated_design import with_sample
 from gs_jax.io.provenance import DepthFrame, frame_of
 from gs_jax.widget.layers import reader
 
-from .test_cli import run
-
 SURFACE = 19.0
 TRUTH = np.array([[0.2, -0.2, 20.5, 1.0], [-0.5, 0.4, 21.5, 1.0]])
 GEL = {"refractive_index": 1.43, "surface_mm": SURFACE, "layers": [{"thickness_mm": 0.17, "refractive_index": 1.523}]}
@@ -33,29 +31,29 @@ def lab(tmp_path, monkeypatch):
     return tmp_path
 
 
-def found_by(monkeypatch, capsys, *options, depths="20:22:0.5"):
+def found_by(run, *options, depths="20:22:0.5"):
     how = ("--depths", depths, "--voxel-um", 80, "--suppress", "points", "--points", "found.csv", "--force")
-    status, _, err = run(monkeypatch, capsys, "reconstruct", "gel.tif", "lab.toml", *options, *how, "-o", "found.tif")
+    status, _, err = run("reconstruct", "gel.tif", "lab.toml", *options, *how, "-o", "found.tif")
     assert status == 0, err
     points = gs.read_points("found.csv")
     return points[np.argsort(points[:, 2])]
 
 
 @pytest.mark.integration
-def test_points_in_a_gel(lab, monkeypatch, capsys):
-    assert run(monkeypatch, capsys, "simulate", "points.csv", "lab.toml", "--sample", "gel", "-o", "gel.tif")[0] == 0
+def test_points_in_a_gel(lab, run):
+    assert run("simulate", "points.csv", "lab.toml", "--sample", "gel", "-o", "gel.tif")[0] == 0
     inside = ("--sample", "gel", "--depths-from", "sample")
-    assert run(monkeypatch, capsys, "simulate", "in-gel.csv", "lab.toml", *inside, "-o", "same.npy")[0] == 0
+    assert run("simulate", "in-gel.csv", "lab.toml", *inside, "-o", "same.npy")[0] == 0
     np.testing.assert_array_equal(gs.read_capture("same.npy"), gs.read_capture("gel.tif"))
-    found = found_by(monkeypatch, capsys, "--sample", "gel")
+    found = found_by(run, "--sample", "gel")
     np.testing.assert_allclose(found[:, :2], TRUTH[:, :2], atol=0.02)
     np.testing.assert_allclose(found[:, 2], TRUTH[:, 2], atol=0.1)
     assert frame_of("found.csv") == frame_of("found.tif") == "array"
     # In air the points seem nearer than they are.
-    in_air = found_by(monkeypatch, capsys, "--sample", "air", depths="19:22:0.5")
+    in_air = found_by(run, "--sample", "air", depths="19:22:0.5")
     assert (found[:, 2] - in_air[:, 2] > 0.4).all()
     # Files that count from the surface say so, and are read as those that do not.
-    from_surface = found_by(monkeypatch, capsys, *inside, depths="1:3:0.5")
+    from_surface = found_by(run, *inside, depths="1:3:0.5")
     np.testing.assert_allclose(from_surface[:, 2], found[:, 2], atol=0.02)
     header, first = np.loadtxt("found.csv", str, delimiter=",", max_rows=2)
     row = dict(zip(header, map(float, first), strict=True))
@@ -64,7 +62,7 @@ def test_points_in_a_gel(lab, monkeypatch, capsys):
     np.testing.assert_allclose(gs.read_volume("found.tif")[1].depths, [20, 20.5, 21, 21.5, 22])
     # Read again they are where they were, from whatever depths count.
     for options in (("--sample", "gel"), inside):
-        status, _, err = run(monkeypatch, capsys, "simulate", "found.csv", "lab.toml", *options, "-o", "again.npy")
+        status, _, err = run("simulate", "found.csv", "lab.toml", *options, "-o", "again.npy")
         assert status == 0, err
     read: Any = reader("found.tif")
     layers = read("found.tif")
@@ -125,11 +123,11 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("arguments", "words"), WRONG)
-def test_what_does_not_go_together(lab, monkeypatch, capsys, arguments, words):
+def test_what_does_not_go_together(lab, run, arguments, words):
     np.save("capture.npy", np.ones((640, 640), np.uint16))
     gs.write_points("from-array.csv", TRUTH, provenance={"depths_from": "array"})
     before = sorted(lab.iterdir())
-    status, _, err = run(monkeypatch, capsys, *arguments.split())
+    status, _, err = run(*arguments.split())
     assert status == 2 and words in err and err.count("\n") == 1 and sorted(lab.iterdir()) == before, err
 
 
@@ -139,11 +137,11 @@ REPORTED = pytest.param("report lab.toml -o a.html", marks=pytest.mark.integrati
 
 @pytest.mark.parametrize("command", [METRICS, RECONSTRUCTED, REPORTED], ids=lambda command: command.split()[0])
 @pytest.mark.parametrize("name", ["gel", pytest.param("none", marks=pytest.mark.integration)])
-def test_commands_say_which_medium_they_take(lab, monkeypatch, capsys, command, name):
+def test_commands_say_which_medium_they_take(lab, run, command, name):
     np.save("capture.npy", np.ones((640, 640), np.uint16))
     gel = "n = 1.43 from z = 19 mm, behind 2 mm of n = 1.52 and 0.17 mm of n = 1.523"
     medium = {"gel": gel, "none": "air, behind 2 mm of n = 1.52"}[name]
-    status, out, err = run(monkeypatch, capsys, *command.split(), "--sample", name)
+    status, out, err = run(*command.split(), "--sample", name)
     assert status == 0 and f"objects in {medium}" in out, err
 
 
@@ -155,8 +153,8 @@ def test_a_volume_from_the_surface_on_is_read_back(tmp_path, name):
     assert gs.read_volume(tmp_path / name)[1].depths.tolist() == pytest.approx([19.0, 19.4, 19.8])
 
 
-def test_metrics_show_the_path_of_the_light(lab, monkeypatch, capsys):
-    status, out, err = run(monkeypatch, capsys, *METRICS.split(), "--sample", "gel", "--json", "m.json")
+def test_metrics_show_the_path_of_the_light(lab, run):
+    status, out, err = run(*METRICS.split(), "--sample", "gel", "--json", "m.json")
     sheet = json.loads((lab / "m.json").read_text())
     assert status == 0 and "2 mm of layers before the array are 1.316 mm of air" in out, err
     assert (sheet["sample_index"], sheet["sample_surface_mm"], sheet["depth_mm"][0]) == (1.43, 19, 19)

@@ -17,11 +17,8 @@ from gs_jax.io.recordings import open_recording, spot_names
 from gs_jax.io.volume_series import JOURNAL
 from gs_jax.io.volumes import read_volume, write_volume
 
-from .test_cli import folder, run
 from .test_files import GRID, VOLUME
 from .test_recording import FRAMES, OPTIONS, volumes
-
-__all__ = ["folder"]
 
 
 @pytest.mark.parametrize(
@@ -69,17 +66,17 @@ def test_gaps(names, gap):
     assert first_gap(names) == gap
 
 
-def test_a_gap_in_a_recording_is_told_where_time_matters(folder, monkeypatch, capsys):
+def test_a_gap_in_a_recording_is_told_where_time_matters(folder, run):
     os.mkdir("frames")
     for number in (1, 2, 4):
         tifffile.imwrite(f"frames/f00{number}.tif", FRAMES[0, :9])
     command = ("reconstruct", "frames", "design.toml", *OPTIONS, "-o", "v.zarr")
-    _, _, err = run(monkeypatch, capsys, *command, "--frame-interval", "0.1")
+    _, _, err = run(*command, "--frame-interval", "0.1")
     assert "gs-jax: frames: captures are missing between f002.tif and f004.tif" in err
-    assert "are missing" not in run(monkeypatch, capsys, *command)[2]
+    assert "are missing" not in run(*command)[2]
 
 
-def test_psfs_that_a_shell_sorted_are_told(tmp_path, monkeypatch, capsys):
+def test_psfs_that_a_shell_sorted_are_told(tmp_path, run, monkeypatch):
     paths = [tmp_path / name for name in ("z10.25.tif", "z11.tif", "z9.tif")]
     for path in paths:
         tifffile.imwrite(path, FRAMES[0, :9])
@@ -95,9 +92,9 @@ def test_psfs_that_a_shell_sorted_are_told(tmp_path, monkeypatch, capsys):
         tifffile.imwrite(f"psfs/{name}.tif", np.eye(16, dtype=np.float32))
     tifffile.imwrite("a.tif", np.ones((16, 16), np.float32))
     command = ("deconvolve", "a.tif", "psfs", "--method", "richardson-lucy", "--steps", "1", "-o", "v.ome.tif")
-    out = run(monkeypatch, capsys, *command, "--depths", "10:12:1")[1]
+    out = run(*command, "--depths", "10:12:1")[1]
     assert "PSFs: z_-100um.tif at 10 mm, z_0um.tif at 11 mm, z_100um.tif at 12 mm\n" in out
-    assert "z_-100um.tif is plane 1, z_0um.tif is plane 2" in run(monkeypatch, capsys, *command)[1]
+    assert "z_-100um.tif is plane 1, z_0um.tif is plane 2" in run(*command)[1]
 
 
 @pytest.mark.parametrize("pattern", ["run[1]/*.tif", "run[1]/f[12].tif", "run[1]", "*/f?.tif", "run[1]/../run[1]/**"])
@@ -123,7 +120,7 @@ def test_volumes_of_any_name(tmp_path, name, suffix):
     np.testing.assert_array_equal(read_volume(path)[0], VOLUME)
 
 
-def test_a_recording_of_any_name(folder, monkeypatch, capsys):
+def test_a_recording_of_any_name(folder, run):
     """With a journal to resume from, points, provenance and messages."""
     os.mkdir("frames")
     names = [os.fsdecode(b"caf\xe9 1.tif"), "bell\x07 2.tif"]
@@ -132,12 +129,12 @@ def test_a_recording_of_any_name(folder, monkeypatch, capsys):
     os.rename("design.toml", design := os.fsdecode(b"d\xe9sign.toml"))
     command = ("reconstruct", "frames", design, *OPTIONS, "-o", output := os.fsdecode(b"v\xe9.zarr"))
     points = os.fsdecode(b"p\xe9.csv")
-    status, out, err = run(monkeypatch, capsys, *command, "--suppress", "points", "--points", points)
+    status, out, err = run(*command, "--suppress", "points", "--points", points)
     assert status == 0, err
     assert "2 frames in" in out and volumes(output).shape[0] == 2
     (journal := json.loads(Path(output, JOURNAL).read_text().splitlines()[0]))["request"]
     assert journal["frames"] == 2
     assert "d\\xe9sign.toml" in read_provenance(points)["command"]
     more = ("--suppress", "points", "--points", points, "--resume", "--force")
-    status, out, _ = run(monkeypatch, capsys, *command, *more)
+    status, out, _ = run(*command, *more)
     assert status == 0 and "all frames were there" in out

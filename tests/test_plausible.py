@@ -11,11 +11,8 @@ from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope
 from gs_jax.design.validation import USUAL, slip
 
-from .helpers import needs
-from .test_cli import DESIGN, folder, run
+from .helpers import DESIGN, needs
 from .test_designs import written
-
-__all__ = ["folder"]
 
 SLIPS = [
     ("imaging.sensor_distance_mm", 5800.0, "imaging.sensor_distance_mm = 5800: did you mean 5.8 mm (5800 um)?"),
@@ -94,10 +91,10 @@ def test_of_what_is_no_number_nothing_is_said(value):
 
 
 @pytest.mark.integration
-def test_commands_say_it_once_and_go_on(folder, monkeypatch, capsys):
+def test_commands_say_it_once_and_go_on(folder, run):
     """Whatever reads the design; a warning of another kind stays what it is."""
     (folder / "design.toml").write_text(DESIGN.replace("sensor_distance_mm = 5.8", "sensor_distance_mm = 58.0"))
-    status, out, err = run(monkeypatch, capsys, "metrics", "design.toml")
+    status, out, err = run("metrics", "design.toml")
     assert status == 0 and "small" in out and "Warning" not in err
     assert err.splitlines() == [line for line in err.splitlines() if line.startswith("gs-jax: design.toml: imaging.")]
     assert err.count("\n") == 1

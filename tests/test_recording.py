@@ -24,10 +24,6 @@ from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.reconstruction.recording import PREFETCH, reconstruct_frames
 from gs_jax.widget.layers import reader
 
-from .test_cli import folder, run
-
-__all__ = ["folder"]
-
 FRAMES = np.random.default_rng(0).integers(100, 3000, (5, 96, 80)).astype(np.uint16)
 OPTIONS = ("--depths", "18:22:1", "--voxel-um", "50")
 WARM = ("--warm-start", "--method")
@@ -90,8 +86,8 @@ def expected(frames=FRAMES, **options):
 
 @pytest.mark.integration
 @pytest.mark.parametrize("name", ["rec.tif", "rec.npy", "frames", "frames/f*.tif", "rec.zarr"])
-def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name):
-    status, out, err = run(monkeypatch, capsys, *command(save(name)))
+def test_every_frame_is_reconstructed_as_alone(folder, run, name):
+    status, out, err = run(*command(save(name)))
     assert (status, beside_progress(err)) == (0, [])
     assert "5 x 5 x 39 x 33 voxels (t, z, y, x), 50 um laterally, 5 depths from 18 to 22 mm" in out
     assert "frames/s" in out
@@ -105,29 +101,29 @@ def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name
 
 
 @pytest.mark.integration
-def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
+def test_the_same_as_page_by_page(folder, run):
     """With a correction, which is read once, and an iterative method."""
     save("rec.tif")
     tifffile.imwrite("dark.tif", np.full((96, 80), 90, np.uint16))
     how = ("--method", "richardson-lucy", "--steps", "2", "--dark", "dark.tif")
-    status, out, _ = run(monkeypatch, capsys, *command("rec.tif", *how))
+    status, out, _ = run(*command("rec.tif", *how))
     assert status == 0 and "5 frames: dark frame dark.tif taken off, median 90" in out
-    run(monkeypatch, capsys, *command("rec.tif", *how, "--page", "4", output="page.zarr"))
+    run(*command("rec.tif", *how, "--page", "4", output="page.zarr"))
     np.testing.assert_allclose(volumes()[3], volumes("page.zarr"), rtol=1e-4, atol=1e-4 * volumes().max())
     assert "dark.tif" in read_provenance("v.zarr")["correction"]
 
 
 @pytest.mark.integration
-def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
-    status, out, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
+def test_a_network_is_checked_on_the_first_frame(folder, run):
+    status, out, err = run(*command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
     assert (status, beside_progress(err)) == (0, []) and out.count("v.zarr: frame 0 imaged again is") == 1
 
 
-def test_what_viewers_are_told(folder, monkeypatch, capsys):
+def test_what_viewers_are_told(folder, run, monkeypatch):
     """Time first, to scale; planes as chunks; a pyramid where a plane is larger than a chunk."""
     monkeypatch.setattr(ngff, "CHUNK", 16)
     monkeypatch.setattr(volume_series, "CHUNK", 16)
-    run(monkeypatch, capsys, *command(save("rec.tif"), "--frame-interval", "0.05"))
+    run(*command(save("rec.tif"), "--frame-interval", "0.05"))
     attributes = json.loads((folder / "v.zarr" / "zarr.json").read_text())["attributes"]["ome"]
     (image,) = attributes["multiscales"]
     assert attributes["version"] == "0.5" and image["axes"] == [
@@ -166,7 +162,7 @@ def test_odd_ends_are_means_of_what_is_there():
 
 
 @pytest.mark.integration
-def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, capsys):
+def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, run):
     frames = np.random.default_rng(1).integers(100, 3000, (60, 96, 80)).astype(np.uint16)
     save("rec.tif", frames)
     arguments = [sys.executable, "-m", "gs_jax", *command("rec.tif")]
@@ -184,9 +180,9 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, c
     np.testing.assert_allclose(volumes()[before], whole[before], rtol=1e-5)
     with journal.open("a") as file:
         file.write('{"frame": 59, "do')  # cut off within a line
-    status, out, _ = run(monkeypatch, capsys, *command("rec.tif"), "--resume")
+    status, out, _ = run(*command("rec.tif"), "--resume")
     assert status == 0 and f"; {len(before)} were there" in out
-    run(monkeypatch, capsys, *command("rec.tif", output="w.zarr"))
+    run(*command("rec.tif", output="w.zarr"))
     resumed, uninterrupted = files(folder / "v.zarr"), files(folder / "w.zarr")
     for each in (resumed, uninterrupted):
         attributes = json.loads(each.pop("zarr.json"))["attributes"]
@@ -197,13 +193,13 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, c
 
 
 @pytest.mark.integration
-def test_bad_frames_are_named_and_made_when_they_are_good(folder, monkeypatch, capsys):
+def test_bad_frames_are_named_and_made_when_they_are_good(folder, run):
     save("frames")
     good = (folder / "frames" / "f10.tif").read_bytes()
     (folder / "frames" / "f10.tif").write_bytes(good[:3000])
     tifffile.imwrite("frames/f8.tif", FRAMES[0, :50])
     (folder / "frames" / "notes.txt").touch()
-    status, out, err = run(monkeypatch, capsys, *command("frames"))
+    status, out, err = run(*command("frames"))
     assert status == 1 and "3 frames in" in out
     assert "gs-jax: frame 0 (f8.tif): " in err and "got 50 x 80 pixels" in err
     assert "gs-jax: frame 2 (f10.tif): " in err and "not a whole and valid TIFF" in err
@@ -212,48 +208,48 @@ def test_bad_frames_are_named_and_made_when_they_are_good(folder, monkeypatch, c
     np.testing.assert_allclose(volumes()[[1, 3, 4]], whole[[1, 3, 4]], rtol=1e-5)
     assert not volumes()[[0, 2]].any()
     (folder / "frames" / "f10.tif").write_bytes(good)
-    status, out, err = run(monkeypatch, capsys, *command("frames"), "--resume")
+    status, out, err = run(*command("frames"), "--resume")
     assert status == 1 and "1 frames in" in out and err.count("frame 0") == 1 and "1 of 5 frames failed" in err
     tifffile.imwrite("frames/f8.tif", FRAMES[0])
-    assert run(monkeypatch, capsys, *command("frames"), "--resume")[0] == 0
+    assert run(*command("frames"), "--resume")[0] == 0
     np.testing.assert_allclose(volumes(), whole, rtol=1e-5)
 
 
-def test_where_no_frame_is_good_nothing_is_written(folder, monkeypatch, capsys):
-    status, _, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:, :50])))
+def test_where_no_frame_is_good_nothing_is_written(folder, run):
+    status, _, err = run(*command(save("rec.tif", FRAMES[:, :50])))
     assert status == 2 and "got 50 x 80 pixels" in err and not (folder / "v.zarr").exists()
 
 
 @pytest.mark.integration
-def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
+def test_an_unfinished_recording_is_not_lost(folder, run):
     save("frames")
     (folder / "frames" / "f10.tif").write_bytes(b"II*\0")
-    run(monkeypatch, capsys, *command("frames"))
+    run(*command("frames"))
     before = files(folder / "v.zarr")
     for options, words in (
         ((), "has 4 of 5 frames of an interrupted recording; give --resume"),
         (("--resume", "--optics", "pinhole"), "optics with --resume must be 'full', as before, got 'pinhole'"),
         (("--resume", "--frame-interval", "2"), "frame_interval with --resume must be none"),
     ):
-        status, _, err = run(monkeypatch, capsys, *command("frames"), *options)
+        status, _, err = run(*command("frames"), *options)
         assert status == 2 and words in err
     tifffile.imwrite("frames/f99.tif", FRAMES[0])
-    status, _, err = run(monkeypatch, capsys, *command("frames"), "--resume")
+    status, _, err = run(*command("frames"), "--resume")
     assert status == 2 and "names of frames" in err
     assert files(folder / "v.zarr") == before
     os.unlink("frames/f10.tif")
-    status, _, err = run(monkeypatch, capsys, *command("frames"), "--force")
+    status, _, err = run(*command("frames"), "--force")
     assert (status, err) == (0, "gs-jax: replaced v.zarr\n") and volumes().shape[0] == 5
     # What is finished is a result as others are.
-    status, _, err = run(monkeypatch, capsys, *command("frames"))
+    status, _, err = run(*command("frames"))
     assert (status, err) == (0, "gs-jax: replaced v.zarr\n")
 
 
 @pytest.mark.integration
-def test_points_of_all_frames_in_one_table(folder, monkeypatch, capsys):
+def test_points_of_all_frames_in_one_table(folder, run):
     save("rec.tif", bead_frames([[0.0], [], [0.2]]))
     how = ("--suppress", "clusters", "--points", "p.csv")
-    assert run(monkeypatch, capsys, *command("rec.tif", *how))[0] == 0
+    assert run(*command("rec.tif", *how))[0] == 0
     header, *rows = (folder / "p.csv").read_text().splitlines()
     assert header == "x_mm,y_mm,z_mm,intensity,frame"
     found = np.array([row.split(",") for row in rows], float)
@@ -262,19 +258,19 @@ def test_points_of_all_frames_in_one_table(folder, monkeypatch, capsys):
     assert np.abs(np.array(x) - (0, 0.2)).max() < 0.051
     assert read_provenance("p.csv")["input rec.tif"].startswith("3 frames")
     # A frame alone has the same points.
-    run(monkeypatch, capsys, *command("rec.tif", *how[:2], "--page", "3", "--points", "q.csv", output="w.zarr"))
+    run(*command("rec.tif", *how[:2], "--page", "3", "--points", "q.csv", output="w.zarr"))
     alone = np.loadtxt(folder / "q.csv", delimiter=",", skiprows=1, ndmin=2)
     np.testing.assert_allclose(alone, found[found[:, 4] == 2, :4], rtol=1e-6)
 
 
-def test_it_is_compiled_once(folder, monkeypatch, capsys):
+def test_it_is_compiled_once(folder, run):
     """Also where a frame is repaired, and thus of another type."""
     frames = FRAMES // 100 + 100
     frames[2, 40, 40] = 65535
     save("rec.tif", frames)
     jitted: Any = backproject
     compiled = jitted._cache_size()
-    status, out, _ = run(monkeypatch, capsys, *command("rec.tif", "--voxel-um", "61"))
+    status, out, _ = run(*command("rec.tif", "--voxel-um", "61"))
     assert status == 0 and "1 frame: pixels filled from neighbours" in out
     assert jitted._cache_size() == compiled + 1
 
@@ -298,14 +294,14 @@ def test_it_is_compiled_once(folder, monkeypatch, capsys):
         ("rec.zarr", ("-o", "rec.zarr"), "rec.zarr: cannot be written"),
     ],
 )
-def test_what_is_no_recording_is_said(folder, monkeypatch, capsys, name, options, words):
+def test_what_is_no_recording_is_said(folder, run, name, options, words):
     os.mkdir("empty")
     for each in ("frames", "rec.tif", "rec.zarr"):
         save(each)
     save("flat.zarr", FRAMES[0])
     save("deep.zarr", np.stack([FRAMES] * 3, 1))
     save("double.zarr", FRAMES.astype(float))
-    status, _, err = run(monkeypatch, capsys, *command(name, *options))
+    status, _, err = run(*command(name, *options))
     assert status == 2 and words in err and len(err) < 400
     assert not any((folder / each).exists() for each in ("v.zarr", "v.ome.tif"))
 

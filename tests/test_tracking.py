@@ -11,10 +11,7 @@ from gs_jax.base.errors import InputError
 from gs_jax.detection.linking import MEMORY, link_particles
 from gs_jax.io.point_tables import read_points
 
-from .test_cli import folder, run
 from .test_recording import bead_frames, command
-
-__all__ = ["folder"]
 
 needs_trackpy = pytest.mark.skipif(not find_spec("trackpy"), reason="needs pip install 'gs-jax[track]'")
 
@@ -61,13 +58,13 @@ def test_crowds_are_refused():
 
 
 @needs_trackpy
-def test_beads_of_a_recording(folder, monkeypatch, capsys):
+def test_beads_of_a_recording(folder, run):
     """Two that move, of which one is dark in a frame, and frames of which one cannot be read."""
     (folder / "frames").mkdir()
     for frame, image in enumerate(bead_frames([(-0.3 + 0.05 * t, 0.3)[: 1 if t == 2 else 2] for t in range(5)])):
         tifffile.imwrite(f"frames/{frame}.tif", image[:50] if frame == 3 else image)
     how = ("--suppress", "clusters", "--points", "p.csv", "--track", "120", "--depths", "20")
-    status, out, err = run(monkeypatch, capsys, *command("frames", *how))
+    status, out, err = run(*command("frames", *how))
     assert status == 1 and "p.csv: 7 points of 2 particles" in out, (out, err)
     header, *rows = (folder / "p.csv").read_text().splitlines()
     assert header == "x_mm,y_mm,z_mm,intensity,frame,particle"
@@ -78,13 +75,13 @@ def test_beads_of_a_recording(folder, monkeypatch, capsys):
     assert read_points(folder / "p.csv").shape == (7, 4)
 
 
-def test_what_cannot_be_tracked_is_one_line(folder, monkeypatch, capsys):
+def test_what_cannot_be_tracked_is_one_line(folder, run, monkeypatch):
     tifffile.imwrite("rec.tif", np.full((2, 96, 80), 16, np.uint16), photometric="minisblack")
-    status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--track", "100"))
+    status, _, err = run(*command("rec.tif", "--track", "100"))
     assert status == 2 and "--track must be used with --points POINTS.csv, which has the particles." in err
-    status, _, err = run(monkeypatch, capsys, *command("capture.tif", "--track", "100", "--points", "p.csv"))
+    status, _, err = run(*command("capture.tif", "--track", "100", "--points", "p.csv"))
     assert status == 2 and "--track must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "trackpy", None)
-    status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--track", "100", "--points", "p.csv"))
+    status, _, err = run(*command("rec.tif", "--track", "100", "--points", "p.csv"))
     assert (status, err) == (2, "gs-jax: trackpy is not installed; it comes with pip install 'gs-jax[track]'.\n")
     assert not (folder / "v.zarr").exists()

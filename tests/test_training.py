@@ -28,7 +28,7 @@ from gs_jax.io.files import side_file
 from gs_jax.io.volumes import read_volume
 from gs_jax.reconstruction.pipeline import reconstruct
 
-from .test_cli import DESIGN
+from .helpers import DESIGN
 
 
 def toy(offsets=(0,), batch=lambda rng: sample_paper_batch(rng, 16)) -> Recipe:

@@ -11,10 +11,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.plan import follow_volume
 
-from .test_cli import folder, run
 from .test_recording import command, save, volumes
-
-__all__ = ["folder"]
 
 STEPS = 16
 GRID = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
@@ -84,11 +81,11 @@ def test_what_follows_a_dark_frame_starts_afresh(level):
 
 
 @pytest.mark.integration
-def test_a_recording_takes_the_option(folder, monkeypatch, capsys):
+def test_a_recording_takes_the_option(folder, run):
     frames = np.random.default_rng(0).integers(100, 3000, (1, 96, 80)).repeat(3, 0).astype(np.uint16)
     how = ("--method", "list-rl", "--steps", "8")
-    run(monkeypatch, capsys, *command(save("rec.tif", frames), *how))
-    status, _, _ = run(monkeypatch, capsys, *command("rec.tif", *how, "--warm-start", output="w.zarr"))
+    run(*command(save("rec.tif", frames), *how))
+    status, _, _ = run(*command("rec.tif", *how, "--warm-start", output="w.zarr"))
     cold, warm = volumes(), volumes("w.zarr")
     assert status == 0 and (warm[0] == cold[0]).all()
     assert (warm[1] != cold[1]).any() and (warm[2] > 0).any()

@@ -18,12 +18,10 @@ from gs_jax.base.errors import InputError
 from gs_jax.base.workers import Workers
 from gs_jax.io.volume_series import JOURNAL
 
-from .test_cli import folder, run
 from .test_recording import FRAMES, command, files, save, volumes
 
 pytestmark = pytest.mark.integration
 
-__all__ = ["folder"]
 
 distributed = pytest.importorskip("distributed", reason="needs pip install 'gs-jax[cluster]'")
 
@@ -111,7 +109,7 @@ def test_nothing_of_dask_is_imported_unless_it_is_asked_for(folder):
     assert done.returncode == 0, done.stderr
 
 
-def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
+def test_what_cannot_work_is_one_line(folder, run, monkeypatch):
     save("rec.tif")
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
@@ -125,12 +123,12 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
             (("--scheduler", "nowhere"), "--scheduler: no Dask scheduler is reachable at nowhere"),
             (("--scheduler", address, "--workers", "2"), "--workers must not be given together with --scheduler"),
         ):
-            status, _, err = run(monkeypatch, capsys, *command("rec.tif", *options))
+            status, _, err = run(*command("rec.tif", *options))
             assert status == 2 and words in err and err.count("\n") == 1
-    status, _, err = run(monkeypatch, capsys, *command("capture.tif", "--workers", "2"))
+    status, _, err = run(*command("capture.tif", "--workers", "2"))
     assert status == 2 and "--workers or --scheduler must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "distributed", None)
-    status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--workers", "2"))
+    status, _, err = run(*command("rec.tif", "--workers", "2"))
     assert (status, err) == (
         2,
         "gs-jax: distributed is not installed; it comes with pip install 'gs-jax[cluster]'.\n",
@@ -154,7 +152,7 @@ def numbers():
     return [json.loads(line)["frame"] for line in (Path("v.zarr") / JOURNAL).read_text().splitlines()[1:]]
 
 
-def test_a_recording_by_workers_one_of_which_is_killed(folder, monkeypatch, capsys):
+def test_a_recording_by_workers_one_of_which_is_killed(folder):
     """The same bytes as by one process, each frame once."""
     frames = np.random.default_rng(1).integers(101, 130, (60, 96, 80)).astype(np.uint16)
     frames[50, 40, 40] = 65535
@@ -175,7 +173,7 @@ def test_a_recording_by_workers_one_of_which_is_killed(folder, monkeypatch, caps
     assert by_two == by_one and points == (folder / "p.csv").read_bytes()
 
 
-def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, capsys):
+def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, run, monkeypatch):
     # Enough to be interrupted: a frame takes some milliseconds.
     count = 900
     frames = np.random.default_rng(2).integers(100, 3000, (count, 96, 80)).astype(np.uint16)
@@ -192,6 +190,6 @@ def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, ca
     monkeypatch.setattr("gs_jax.base.workers._ANSWER", 60)
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
         arguments = command("rec.tif", "--resume", "--scheduler", cluster.scheduler_address)
-        status, out, _ = run(monkeypatch, capsys, *arguments)
+        status, out, _ = run(*arguments)
     assert status == 0 and f"{count - len(before)} frames in" in out and sorted(numbers()) == list(range(count))
     assert volumes().any((1, 2, 3)).all()
