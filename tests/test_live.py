@@ -1,25 +1,36 @@
 """Captures that become volumes while they come: which first, which again, and what a run after this finds."""
 
 import json
+import math
 import os
 import re
+import signal
+import socket
+import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import tifffile
 
 from gs_jax import Grid, InputError
+from gs_jax.base import machine, progress as module
+from gs_jax.base.errors import InputError as InputError
+from gs_jax.base.progress import QUIET, VERBOSE, CancellableProgress, Cancelled, Progress, verbosity
+from gs_jax.base.workers import Workers
 from gs_jax.cli.recordings import _State
 from gs_jax.io.captures import read_capture
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, check_replaceable, read_series
 from gs_jax.io.watched_folder import WatchedFolder
 from gs_jax.reconstruction import recording as live
 
-from .test_recording import FRAMES, OPTIONS, expected, level, volumes
+from .test_cli import RECONSTRUCT
+from .test_recording import FRAMES, OPTIONS, command, expected, files, level, save, volumes
 
 pytest.importorskip("watchfiles", reason="no watchfiles: pip install 'gs-jax[live]'")
 
@@ -300,3 +311,325 @@ def test_wrong_input_is_one_line(folder, run, monkeypatch):
     status, _, err = run(*WATCH)
     assert status == 2 and "pip install 'gs-jax[live]'" in err and err.count("\n") == 1
     assert not os.path.exists("v.zarr")
+
+
+# Jobs that other processes do: the same results, whoever does them and whoever dies.
+
+
+pytestmark = pytest.mark.integration
+
+
+distributed = pytest.importorskip("distributed", reason="needs pip install 'gs-jax[cluster]'")
+
+
+@pytest.fixture(scope="module")
+def two():
+    with Workers(2) as workers:
+        yield workers
+
+
+def squares(path: Path):
+    """Notes who makes it; the job 7 ends its worker the first time."""
+    with open(path / "made", "a") as file:
+        file.write(f"{os.getpid()}\n")
+
+    def square(number):
+        if number == 7 and not (path / "killed").exists():
+            (path / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if number == 5:
+            raise InputError("found five.")
+        return number**2, os.getpid()
+
+    return square
+
+
+def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(two, tmp_path):
+    found, refused = {}, []
+    for number, result in two.mapper(partial(squares, tmp_path))(range(40)):
+        try:
+            found[number] = result()
+        except InputError as error:
+            refused.append(str(error))
+    assert {number: square for number, (square, _) in found.items()} == {n: n**2 for n in range(40) if n != 5}
+    assert refused == ["found five."] and (tmp_path / "killed").exists()
+    # Each worker makes the function once: two, and the one that came for another.
+    made = (tmp_path / "made").read_text().split()
+    assert len(made) == len(set(made)) <= 3 and {str(process) for _, process in found.values()} <= set(made)
+    assert str(os.getpid()) not in made
+
+
+def settings():
+    import jax
+
+    return lambda _: (str(jax.numpy.zeros(()).dtype), os.getcwd(), os.environ["NPROC"])
+
+
+def test_workers_share_the_cores_and_have_this_process_settings(two, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ((_, result),) = two.mapper(settings)([0])
+    dtype, where, threads = result()
+    assert (dtype, where) == ("float64", str(tmp_path)) and 2 * int(threads) <= max(2, os.cpu_count() or 1)
+
+
+def test_no_more_is_taken_than_is_needed(two):
+    """However long the recording is."""
+    taken = []
+
+    def items():
+        for number in range(30):
+            taken.append(number)
+            yield number
+
+    for done, (_, result) in enumerate(two.mapper(settings)(items())):
+        assert result() and len(taken) - done <= 5
+
+
+def test_in_this_process_jobs_are_done_one_by_one():
+    done = []
+    with Workers() as workers:
+        for number, result in workers.mapper(lambda: done.append)([1, 2]):
+            assert len(done) == number - 1
+            result()
+    assert done == [1, 2] and not Workers().remote
+
+
+def test_nothing_of_dask_is_imported_unless_it_is_asked_for(folder):
+    save("rec.tif", FRAMES[:1].repeat(2, 0))
+    code = (
+        f"import sys; sys.argv = ['gs-jax', *{command('rec.tif')!r}]\n"
+        "from gs_jax.__main__ import main\n"
+        "try:\n    main()\nfinally:\n    assert not {'dask', 'distributed', 'trackpy'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_cannot_work_is_one_line(folder, run, monkeypatch):
+    save("rec.tif")
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{nobody.getsockname()[1]}"
+        monkeypatch.setattr("gs_jax.base.workers._ANSWER", 0.5)
+        for options, words in (
+            (
+                ("--scheduler", address),
+                f"--scheduler: no Dask scheduler is reachable at {address}",
+            ),
+            (("--scheduler", "nowhere"), "--scheduler: no Dask scheduler is reachable at nowhere"),
+            (("--scheduler", address, "--workers", "2"), "--workers must not be given together with --scheduler"),
+        ):
+            status, _, err = run(*command("rec.tif", *options))
+            assert status == 2 and words in err and err.count("\n") == 1
+    status, _, err = run(*command("capture.tif", "--workers", "2"))
+    assert status == 2 and "--workers or --scheduler must be used with a recording" in err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    status, _, err = run(*command("rec.tif", "--workers", "2"))
+    assert (status, err) == (
+        2,
+        "gs-jax: distributed is not installed; it comes with pip install 'gs-jax[cluster]'.\n",
+    )
+    assert not (folder / "v.zarr").exists()
+
+
+def started(*options):
+    """The command as a process, when a few frames of it are written; and its workers."""
+    arguments = [sys.executable, "-m", "gs_jax", *command("rec.tif", *options)]
+    process = psutil.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    journal, deadline = Path("v.zarr") / JOURNAL, time.monotonic() + 200
+    while not (journal.exists() and journal.read_bytes().count(b"\n") > 3) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    children = process.children(recursive=True)
+    return process, [each for each in children if "spawn_main" in " ".join(each.cmdline())]
+
+
+def numbers():
+    """Of the frames in the journal, in its order."""
+    return [json.loads(line)["frame"] for line in (Path("v.zarr") / JOURNAL).read_text().splitlines()[1:]]
+
+
+def test_a_recording_by_workers_one_of_which_is_killed(folder):
+    """The same bytes as by one process, each frame once."""
+    frames = np.random.default_rng(1).integers(101, 130, (60, 96, 80)).astype(np.uint16)
+    frames[50, 40, 40] = 65535
+    save("rec.tif", frames)
+    process, workers = started("--workers", "2", "--suppress", "clusters", "--points", "p.csv")
+    workers[0].kill()
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0 and "60 frames in" in out and "Traceback" not in err, err
+    assert "1 frame: pixels filled from neighbours" in out and sorted(numbers()) == list(range(60))
+    by_two, points = files(folder / "v.zarr"), (folder / "p.csv").read_bytes()
+    arguments = command("rec.tif", "--suppress", "clusters", "--points", "p.csv", "--force")
+    subprocess.run([sys.executable, "-m", "gs_jax", *arguments], check=True, capture_output=True)
+    by_one = files(folder / "v.zarr")
+    for each in (by_two, by_one):
+        each.pop(JOURNAL)
+        # It says by which command, and what is shown is as bright as the first volume that was done.
+        each.pop("zarr.json")
+    assert by_two == by_one and points == (folder / "p.csv").read_bytes()
+
+
+def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, run, monkeypatch):
+    # Enough to be interrupted: a frame takes some milliseconds.
+    count = 900
+    frames = np.random.default_rng(2).integers(100, 3000, (count, 96, 80)).astype(np.uint16)
+    save("rec.tif", frames)
+    process, workers = started("--workers", "2")
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in err, err
+    assert err.endswith("gs-jax: interrupted; v.zarr has what is done, and --resume goes on from it\n")
+    assert not psutil.wait_procs(workers, timeout=20)[1]
+    before = numbers()
+    # What it says that it has is there.
+    assert len(before) >= 3 and volumes()[before].any((1, 2, 3)).all()
+    monkeypatch.setattr("gs_jax.base.workers._ANSWER", 60)
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
+        arguments = command("rec.tif", "--resume", "--scheduler", cluster.scheduler_address)
+        status, out, _ = run(*arguments)
+    assert status == 0 and f"{count - len(before)} frames in" in out and sorted(numbers()) == list(range(count))
+    assert volumes().any((1, 2, 3)).all()
+
+
+# How far long work is, on a terminal and in a pipe.
+
+
+@pytest.fixture(autouse=True)
+def _lines_come_as_a_user_gets_them(monkeypatch):
+    monkeypatch.setattr(module, "_EVERY", 10.0)
+    monkeypatch.setattr(module, "_MEASURED", 3.0)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Four seconds pass each time that it is read."""
+    times = map(float, range(0, 10_000, 4))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
+
+
+def test_a_pipe_gets_a_line_now_and_then(clock, capsys):
+    with Progress() as progress:
+        assert list(progress.track(range(8), "Imaging")) == list(range(8))
+    out, err = capsys.readouterr()
+    assert out == "" and err.splitlines() == [
+        "gs-jax: Imaging: 3 of 8, 12 s, about 20 s left",
+        "gs-jax: Imaging: 6 of 8, 24 s, about 8 s left",
+    ]
+
+
+def test_work_of_unknown_length_has_no_forecast(clock, capsys):
+    with Progress() as progress:
+        assert list(progress.track(iter("abc"), "Reading")) == ["a", "b", "c"]
+    assert capsys.readouterr().err == "gs-jax: Reading: 3, 12 s\n"
+
+
+def test_short_work_and_what_is_not_entered_are_silent(capsys):
+    with Progress() as progress, progress.step("Writing"):
+        pass
+    assert list(Progress().track(range(3), "Imaging")) == [0, 1, 2]
+    assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_gets_a_bar_with_count_and_time_left(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with Progress() as progress:
+        list(progress.track(range(5), "Imaging"))
+    err = capsys.readouterr().err
+    assert "Imaging" in err and "5/5" in err and "left:" in err
+
+
+def test_how_much_is_shown(clock, capsys):
+    for shown, said in ((QUIET, ""), (VERBOSE, "gs-jax: Reading: 2, 12 s\n")):
+        token = verbosity.set(shown)
+        with Progress() as progress:
+            list(progress.track(iter("ab"), "Reading"))
+        verbosity.reset(token)
+        assert capsys.readouterr().err == said
+
+
+def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
+    monkeypatch.setattr(module, "peak_memory", lambda: 2.9 * 2**30)
+    for count, quarter, said in ((20, "", "80 s in all"), (600, "--voxel-um 80", "40 min in all")):
+        with Progress() as progress:
+            list(progress.track(range(count), "Iterating", quarter=quarter))
+        wanted = f"gs-jax: Iterating: about {said}, 2.9 GiB of memory" + (
+            f"; {quarter}: about 10 min" if quarter else ""
+        )
+        assert capsys.readouterr().err.splitlines()[0] == wanted
+
+
+@pytest.mark.parametrize("status", ["Name:\tpython\nThreads:\t4\n", None])
+def test_memory_where_proc_does_not_tell_it(status, monkeypatch, tmp_path):
+    """Without `VmHWM`, and without `/proc`."""
+    file = tmp_path / "status"
+    if status:
+        file.write_text(status, encoding="utf-8")
+    monkeypatch.setattr(machine, "Path", lambda _: file)
+    assert math.isnan(machine.status_mib("VmRSS"))
+    now = psutil.Process().memory_info().rss
+    # The kernel counts pages of threads late; the process that started this one may have had more.
+    assert 0.9 * now < machine.peak_memory() < 100 * now
+
+
+def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys):
+    """As of a recording: the first frame compiles for 20 s, the second waits a second for the first to be written."""
+    times = iter([0.0, 20.0, 21.0, *(21.0 + 0.1 * n for n in range(1, 5000))])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
+    monkeypatch.setattr(module, "peak_memory", lambda: 2**30)
+    with Progress() as progress:
+        list(progress.track(range(800), "Reconstructing"))
+    lines = capsys.readouterr().err.splitlines()
+    said = [line for line in lines if "in all" in line]
+    assert said == ["gs-jax: Reconstructing: about 80 s in all, 1 GiB of memory"]
+    # After the line for the first frame, which knows no better.
+    assert all(int(left) <= 80 for left in re.findall(r"about (\d+) s left", "\n".join(lines[1:])))
+
+
+def test_another_thread_sees_it_and_ends_it(monkeypatch, capsys):
+    """The innermost piece of work; after a part, or before the next piece."""
+    times = map(float, range(0, 100, 2))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
+    seen, ends = [], False
+    progress = CancellableProgress(lambda: ends)
+    assert progress.state == ("", 0, None)
+    with pytest.raises(Cancelled), progress.step("Reconstructing"):
+        seen.append(progress.state)
+        for number in progress.track(range(5), "Iterating"):
+            seen.append(progress.state)
+            ends = number == 2
+    assert seen == [
+        ("Reconstructing", 0, None),
+        ("Iterating: 0 of 5", 0, 5),
+        ("Iterating: 1 of 5", 1, 5),
+        ("Iterating: 2 of 5, about 6 s left", 2, 5),
+    ]
+    assert progress.state == ("", 0, None) and capsys.readouterr().err == ""
+    with pytest.raises(Cancelled), progress.step("Writing"):
+        seen.append("not reached")
+    assert "not reached" not in seen
+
+
+def test_the_terminal_announces_it_too(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(module, "_LONG", 0.0)
+    monkeypatch.setattr(module, "_MEASURED", 0.0)
+    with Progress() as progress:
+        list(progress.track(range(3), "Imaging"))
+    assert "Imaging: about" in capsys.readouterr().err
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("method", ["list-rl", "admm"])
+def test_the_memory_that_is_announced_is_what_is_taken(folder, method):
+    """By the kernel's count at the end, within a factor of two; and the voxels named are twice as wide."""
+    arguments = ["gs-jax", *RECONSTRUCT, "--method", method, "--steps", "4", "--voxel-um", "50", "-o", "v.ome.tif"]
+    code = (
+        "import sys; from gs_jax.base import progress, machine; from gs_jax.__main__ import main\n"
+        f"progress._LONG = progress._MEASURED = 0; sys.argv = {arguments!r}\n"
+        "try:\n    main()\nfinally:\n    print(machine.peak_memory() / 2**30)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    line = next(line for line in done.stderr.splitlines() if "Iterating: about" in line)
+    announced = float(re.findall(r"([\d.]+) GiB of memory; --voxel-um 100: about", line)[0])
+    taken = float(done.stdout.splitlines()[-1])
+    assert taken / 2 <= announced <= 2 * taken and taken > 0.1

@@ -15,10 +15,10 @@ from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS, Term
 from gs_jax.design.start import geomscope
 
+from .test_live import two
 from .test_pareto import STUDY
 from .test_training import TINY
 from .test_unrolled import TINY as TINY_UNROLLED
-from .test_workers import two
 
 pytestmark = pytest.mark.integration
 
