@@ -23,7 +23,7 @@ from gs_jax.io.camera import Correction, read_corrected
 from gs_jax.io.captures import Selection
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.recordings import open_recording, read_spots
-from gs_jax.io.volumes import read_volume as read_volume, write_volume
+from gs_jax.io.volumes import write_volume
 
 from .helpers import DESIGN
 from .test_files import GRID, VOLUME
