@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from matplotlib.quiver import QuiverKey
+from scipy.io import loadmat
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+import gs_jax as gs
 from experiments.calibration import NAMES, device, on_captures, true_values
+from experiments.printed_array import FAR as FAR_MM, SHAPE, recipe
 from gs_jax import (
     Camera,
     Design,
@@ -33,11 +36,11 @@ from gs_jax import (
 from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
-from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
+from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, calibrate, self_calibrate
 from gs_jax.calibration.initial_guess import guess_without_lenses, match_pattern, match_shift
 from gs_jax.calibration.sources import Sources, Spots, alternatives
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
-from gs_jax.calibration.spots import find_spots
+from gs_jax.calibration.spots import find_blurred_spots, find_spots, half_light_radii
 from gs_jax.cli.calibrate import FIT_NAMES
 from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout
@@ -45,6 +48,7 @@ from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
 from gs_jax.layers import reduced_distance
+from gs_jax.layouts import hexagonal_layout, square_layout
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type
 from gs_jax.optics.raytrace import to_numpy
@@ -541,3 +545,297 @@ def test_ray_traced_captures():
     assert whole.rms < 0.3 and max(found["held_out_rms_pixels"].values()) < 0.3
     assert found["values"]["sensor_distance_mm"] == pytest.approx(5.85, abs=1e-3)
     assert found["points_f1"] == 1 and found["points_axial_um"] < 20
+
+
+# Calibration by wide spots: a white surface's images, which are discs that we draw, and a real printed array.
+
+
+FAR = np.array([[0.0, 0.0, FAR_MM]])
+
+
+def discs(shape, middles, radius: float, seed=0) -> np.ndarray:
+    """Evenly lit discs at `(row, column)`, darker toward their edges, on an offset, with shot noise."""
+    rows, columns = np.arange(shape[0])[:, None], np.arange(shape[1])[None]
+    light = np.zeros(shape)
+    for row, column in middles:
+        distance = np.hypot(rows - row, columns - column)
+        light += np.clip(radius - distance + 0.5, 0, 1) * (1 - 0.3 * np.minimum(distance / radius, 1) ** 2)
+    return 100 + np.random.default_rng(seed).poisson(3000 * light + 20).astype(float)
+
+
+def pattern_device() -> tuple[Imager, Imager]:
+    """A device with its array mirrored, turned, moved and shrunk, and its design."""
+    centers = np.asarray(random_layout(24, (5.5, 5.5), pitch=0.9, seed=3))
+    design = Imager(MicrolensArray(centers), Sensor((480, 500), 0.015), 5.8, 2.5)
+    built = dataclasses.replace(design.array, centers=0.98 * centers * (1, -1))
+    return dataclasses.replace(design, array=built, rotation=2.0, shift=(0.3, -0.2)), design
+
+
+def white(actual: Imager, place=FAR, radius=20.0) -> np.ndarray:
+    middles = np.asarray(actual.project(place))[:, 0]
+    return discs(actual.sensor.shape, np.asarray(actual.sensor.to_pixels(middles)), radius)
+
+
+def test_middles_and_widths_of_discs():
+    rng = np.random.default_rng(0)
+    places = np.stack(np.meshgrid([60, 110, 160], [60, 110, 160, 210]), -1).reshape(-1, 2) + rng.uniform(-2, 2, (12, 2))
+    image = discs((220, 270), places, 15.0)
+    middles, radii = find_blurred_spots(image, 50.0, 20)
+    away = np.linalg.norm(middles[:, None] - places, axis=-1)
+    assert len(middles) == 12 and away.min(0).max() < 0.05
+    # Half of an even disc's light is within 0.71 of its radius; these are darker toward the edge.
+    assert np.all((radii > 9.9) & (radii < 10.6))
+    assert half_light_radii(np.zeros((50, 50)), np.array([[25.0, 25.0]]), np.array([30.0])) == 0
+    assert len(find_blurred_spots(np.zeros((80, 80)), 30.0, 5)[0]) == 0
+
+
+def test_chance_is_no_pattern_of_wide_spots():
+    centers = np.asarray(random_layout(40, (8.0, 8.0), pitch=1.0, seed=1))
+    chance = np.random.default_rng(0).uniform(-4, 4, (20, 2))
+    assert not match_pattern(chance, centers, 1.0, 0.5, blurred=True).is_clear
+
+
+@pytest.mark.parametrize("layout", [hexagonal_layout, square_layout])
+@pytest.mark.parametrize(("turned", "moved"), [(0.0, 0j), (2.0, 0.7 + 0.9j)])
+def test_of_a_regular_array_the_pose_next_to_the_design_is_found(layout, turned, moved):
+    """The design is turned and moved already in the second: every other lens of the array fits as well."""
+    centers = np.asarray(layout((9.0, 9.0), pitch=1.0))
+    factor, shift = 1.05 * np.exp(1j * (turned + 0.1)), moved + 0.2 - 0.3j
+    spots = (centers @ (1, 1j) * factor + shift)[np.argsort(np.hypot(*centers.T))][:20]
+    design = np.exp(1j * turned)
+    found = match_pattern(np.stack([spots.real, spots.imag], -1), centers, design, 0.5, blurred=True, shift=moved)
+    assert not found.mirrored and found.on_lenses == 20
+    assert abs(found.factor - factor) < 1e-6 and abs(found.shift - shift) < 1e-6
+
+
+@pytest.mark.integration
+def test_a_white_surface_shows_rotation_shift_and_scale():
+    actual, design = pattern_device()
+    found = calibrate([white(actual)], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    assert found.mirrored and len(found.residuals) == 24 and found.rms < 0.1
+    np.testing.assert_allclose(found.imager.centers, actual.centers, atol=0.02 * actual.sensor.pixel_pitch)
+    assert found.values["scale"] == pytest.approx(0.98, abs=1e-4)
+    # Discs that touch draw each other's middles a little.
+    touching = calibrate([white(actual, radius=27.0)], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    np.testing.assert_allclose(touching.imager.centers, actual.centers, atol=0.1 * actual.sensor.pixel_pitch)
+    # Images that overlap show no lenses, nor does the dark.
+    for image in (white(actual, radius=45.0), np.random.default_rng(0).normal(100, 2, actual.sensor.shape)):
+        with pytest.raises(InputError, match="captures: a pattern must show an image of each lens .*, got"):
+            calibrate([image], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    with pytest.raises(InputError, match="capture 1 must have one source, .*, got 2"):
+        calibrate(
+            [white(actual)], np.repeat(FAR, 2, 0), design, fit=PATTERN_FITTED, captures=np.zeros(2, int), blurred=[0]
+        )
+
+
+@pytest.mark.parametrize("layout", [square_layout, pytest.param(hexagonal_layout, marks=pytest.mark.integration)])
+def test_discs_that_touch_in_uneven_light_leave_errors_that_hold(layout):
+    """Four fifths of the picture are lit: its median is the discs' own light, a third darker at one side."""
+    size, pixel = 0.125, 0.0074
+    centers = np.asarray(layout((1.6, 1.6), pitch=size))
+    design = Imager(MicrolensArray(centers), Sensor((250, 250), pixel), 2.4, 0.5)
+    built = dataclasses.replace(design.array, centers=1.01 * centers)
+    actual = dataclasses.replace(design, array=built, rotation=0.01)
+    y, x = np.mgrid[-0.5:0.5:250j, -0.5:0.5:250j]
+    image = white(actual, radius=1.01 * size / 2 / pixel + 0.3) * (1 + 0.3 * x - 0.6 * (x**2 + y**2))
+    found = calibrate([image], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    assert len(found.residuals) == len(centers) and found.rms < 0.18
+    for name, true in (("scale", 1.01), ("rotation_deg", np.degrees(0.01))):
+        assert abs(found.values[name] - true) < 3 * found.deviations[name]
+    assert found.deviations["scale"] < 5e-4
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("design", "image", "pitch", "by_phase", "rms"),
+    [
+        # By the phase of the lattice and by masks of the discs.
+        ("ur.toml", "ur_w.tif", 0.125, 17.209, 0.18),
+        # By the phase, whose mean over both directions changes by 0.001 with the window.
+        ("guv.toml", "Radiometry_GUVExperim1.tif", 0.1, 15.4007, 0.14),
+    ],
+)
+def test_real_white_images(design, image, pitch, by_phase, rms):
+    data = needs("whiteimages/ur_w.tif").parent
+    imager = read_design(data / design).imager()
+    found = calibrate([read_capture(data / image, imager.sensor.shape)], FAR, imager, fit=PATTERN_FITTED, blurred=[0])
+    pixels = pitch * float(imager.scale(FAR_MM)) / imager.sensor.pixel_pitch
+    assert found.rms < rms and abs(found.values["scale"] * pixels - by_phase) < 3 * found.deviations["scale"] * pixels
+    assert found.deviations["scale"] < 5e-4
+
+
+@pytest.mark.integration
+def test_an_overexposed_white_image_is_said_to_be(tmp_path):
+    data = needs("whiteimages/ur_over.tif").parent
+    names = [str(data / "ur.toml"), "--pattern", str(data / "ur_over.tif"), "-o", str(tmp_path / "found.toml")]
+    result = CliRunner().invoke(commands, ["calibrate", *names])
+    assert "ur_over.tif: 310649 pixels (0.63 of all) are saturated at 255" in result.stderr
+
+
+@pytest.mark.integration
+def test_centres_agree_with_those_of_another_program():
+    """In a quarter of a foreign ray-traced white image."""
+    data = needs("plenoptic/white.tif").parent
+    theirs = loadmat(data / "sf_cal.mat")["cal"][0, 0]
+    theirs = np.stack([theirs[name].ravel() - 1 for name in ("exactY", "exactX")], -1)
+    imager = read_design(data / "plen.toml").imager()
+    image = read_capture(data / "white.tif", imager.sensor.shape)[:1000, :1000]
+    imager = dataclasses.replace(imager, sensor=Readout(roi=(0, 0, 1000, 1000)).sensor(imager.sensor))
+    near = np.abs(np.asarray(imager.array.centers) + 3.1).max(1) < 2.9
+    imager = dataclasses.replace(imager, array=dataclasses.replace(imager.array, centers=imager.array.centers[near]))
+    found = calibrate([image], FAR, imager, fit=PATTERN_FITTED, blurred=[0])
+    away, which = KDTree(theirs).query(spots := np.asarray(imager.sensor.to_pixels(found.spots.positions)))
+    off = (spots - theirs[which])[away < 5]
+    assert len(off) > 2000 and np.abs(off.mean(0)).max() < 0.01 and np.sqrt((off**2).sum(1).mean()) < 0.1
+
+
+@pytest.mark.integration
+def test_the_command_takes_a_white_surface_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    actual, listed = pattern_device()
+    listed = dataclasses.replace(listed, array=dataclasses.replace(listed.array, size=(5.6, 5.6)))
+    write_design("listed.toml", Design.from_imager(listed, name="small", working_distance_mm=(18.0, 23.0)))
+    write_capture("white.tif", white(actual).astype(np.float32))
+    arguments = ["calibrate", "listed.toml", "--pattern", "white.tif", "-o", "found.toml"]
+    told = CliRunner().invoke(commands, arguments, catch_exceptions=False).stdout
+    assert "found.toml: 24 spots" in told and "the array mirrored (y to -y) and rotated" in told
+    found = read_design("found.toml")
+    np.testing.assert_allclose(found.imager().centers, actual.centers, atol=0.02 * actual.sensor.pixel_pitch)
+    assert found.imaging == read_design("listed.toml").imaging and (tmp_path / "found.toml.png").exists()
+    assert set(found.provenance["calibrated_values"]) == {"rotation_deg", "shift_x_mm", "shift_y_mm", "scale"}
+    wrong = CliRunner().invoke(commands, [*arguments, "--force", "--hold", "scale"])
+    assert "apart from its neighbours, at the design's scale unless that is fitted, got" in str(wrong.exception)
+
+
+@pytest.mark.integration
+def test_a_white_surface_tells_scale_from_sensor_distance():
+    """Which a bead alone does not. The surface's light comes from far to one side, as nobody said."""
+    actual, design = pattern_device()
+    surface, bead = white(actual, np.array([[300.0, -200.0, FAR_MM]])), np.array([[0.3, -0.2, 18.0]])
+    start, places = dataclasses.replace(design, sensor_distance=5.6), np.append(bead, [[np.nan, np.nan, FAR_MM]], 0)
+    fit = ("sensor_distance", *PATTERN_FITTED)
+    # Four lenses are no pattern of their own.
+    few = render_spots(traced_spots(actual, bead[0])[:4], actual.sensor.shape)
+    for image in (*captures(actual, bead), few):
+        found = calibrate([image, surface], places, start, fit=fit, blurred=[1])
+        assert found.values["sensor_distance_mm"] == pytest.approx(5.8, abs=0.005)
+        assert found.values["scale"] == pytest.approx(0.98, abs=3e-4)
+
+
+@pytest.mark.integration
+def test_a_printed_array_of_37_radii():
+    """Mirrored, turned, out of focus and of unknown scale: what `experiments/printed_array.py` measures in full."""
+    data = needs("randoscope/psf.tif").parent
+    found = calibrate([read_capture(data / "psf.tif", SHAPE)], FAR, recipe(data), fit=PATTERN_FITTED, blurred=[0])
+    assert found.mirrored and len(found.residuals) == 37 and found.rms < 2
+    assert found.values["rotation_deg"] == pytest.approx(150.4, abs=0.5)
+    assert found.values["scale"] == pytest.approx(1.36, abs=0.01)
+
+
+# Calibration through layers: in air with filter and window in place, then of what is not known about a sample.
+
+
+FILTER, WINDOW = gs.Layers([2.0], [1.52]), gs.Layers([0.6, 0.55], [1.0, 1.51])
+GEL = gs.Sample(1.43, surface=17.0, layers=gs.Layers([0.17], [1.523]))
+
+
+def layered(kind: str) -> tuple[gs.Imager, gs.Imager]:
+    """A tilted device with filter and window, and its design, whose sensor distance is off."""
+    actual, design, _ = device(0)
+    numbers = {"types": {"radius_of_curvature": np.resize([2.0, 2.05], 60)}, "curved": {"orientation": "curved"}}
+    array = dataclasses.replace(actual.array, **numbers.get(kind, {}))
+    filters = gs.Layers([0.3, 2.0], [1.0, 1.52]) if kind == "curved" else FILTER
+    actual = dataclasses.replace(actual, array=array, filters=filters, windows=WINDOW)
+    # In focus, as without layers.
+    actual = dataclasses.replace(actual, sensor_distance=to_numpy(actual).sensor_distance_of(5.8))
+    array = dataclasses.replace(array, centers=design.array.centers)
+    moved = {
+        "sensor_distance": 1.03 * float(actual.sensor_distance),
+        "rotation": 0.0,
+        "shift": (0.0, 0.0),
+        "tilt": None,
+    }
+    return actual, dataclasses.replace(actual, array=array, **moved)
+
+
+@pytest.mark.parametrize("kind", ["curved", pytest.param("types", marks=pytest.mark.integration)])
+def test_a_stack_is_calibrated_in_air(kind):
+    actual, design = layered(kind)
+    points = MANY[[0, 7]]
+    found = calibrate(captures(actual, points), points, design)
+    assert found.rms < 0.1
+    check(found, actual)
+
+
+SCENE = np.zeros(9, int)
+
+
+@pytest.mark.parametrize("kind", ["plano", pytest.param("types", marks=pytest.mark.integration)])
+def test_points_of_known_depths_give_surface_and_index(kind):
+    actual, _ = layered(kind)
+    # In the second, the layers of the design end where the sample begins.
+    layers = gs.Layers([2.0, 14.83, 0.17], [1.52, 1.0, 1.523])
+    guess = dataclasses.replace(actual, sample=gs.Sample(1.38, 16.5, GEL.layers))
+    if kind == "types":
+        guess = dataclasses.replace(actual, filters=layers, sample=gs.Sample(1.38))
+    actual = dataclasses.replace(actual, sample=GEL)
+    found = calibrate(captures(actual, MANY, SCENE), MANY, guess, captures=SCENE, fit=("sample_at", "sample_index"))
+    for name, true in (("sample_at_mm", 17.0), ("sample_index", 1.43)):
+        assert abs(found.values[name] - true) < 4 * found.deviations[name] < 0.2
+    sample = found.imager.sample
+    assert sample is not None and sample.surface is not None
+    assert float(sample.surface) == found.values["sample_at_mm"]
+    # What is not fitted is the imager's.
+    assert float(found.imager.sensor_distance) == float(actual.sensor_distance) and not found.mirrored
+
+
+@pytest.mark.integration
+def test_points_that_nobody_knows_do_not_give_an_index():
+    wet = dataclasses.replace(layered("plano")[0], sample=GEL)
+    image, grid = captures(wet, MANY, SCENE)[0], gs.Grid([17.2, 23.0], (121, 121), 0.05)
+    with pytest.raises(gs.InputError, match="do not determine sample_index.*; give the depths of points in the sample"):
+        self_calibrate(image, wet, grid, fit=("sample_index",))
+
+
+@pytest.mark.parametrize(
+    ("sample", "fit", "depth", "words"),
+    [
+        (None, "sample_index", 20.0, "fit: sample_index needs a microscope with a sample, got one in air"),
+        (gs.Sample(1.33), "sample_at", 20.0, "fit: sample_at needs a sample behind a gap of air, got one in contact"),
+        (GEL, "tilt", 16.0, "positions: depths must be 17 mm, where the sample begins, or more, got 16 mm"),
+        (None, "tilt", 1.5, "positions: depths must be 2 mm, where the filters end, or more, got 1.5 mm"),
+    ],
+)
+def test_what_cannot_be_fitted_of_a_sample_is_refused_in_words(sample, fit, depth, words):
+    scope = dataclasses.replace(layered("plano")[0], sample=sample)
+    with pytest.raises(gs.InputError, match=words):
+        calibrate([np.zeros(scope.sensor.shape)], np.array([[0.0, 0.0, depth]]), scope, fit=[fit])
+
+
+@pytest.mark.integration
+def test_the_command_takes_sources_in_air_and_then_a_gel(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    actual, listed = (dataclasses.replace(one, sensor=gs.Sensor((2400, 2400), 0.006)) for one in layered("plano"))
+    listed = dataclasses.replace(listed, array=dataclasses.replace(listed.array, size=(14.0, 14.0)))
+    gel = {"refractive_index": 1.38, "surface_mm": 16.5, "layers": [{"thickness_mm": 0.17, "refractive_index": 1.523}]}
+    design = gs.Design.from_imager(listed, name="small", working_distance_mm=(18.0, 30.0))
+    gs.write_design("small.toml", design.replace(samples={"gel": gel}))
+    scenes = {"air.tif": actual, "gel.tif": dataclasses.replace(actual, sample=GEL)}
+    for name, scope in scenes.items():
+        gs.write_capture(name, captures(scope, MANY, SCENE)[0].astype(np.float32))
+    lines = [f"1,{x},{y},{z}" for x, y, z in MANY]
+    (tmp_path / "p.csv").write_text("\n".join(["capture,x_mm,y_mm,z_mm", *lines]) + "\n")
+    run = lambda *options: CliRunner().invoke(commands, ["calibrate", *options, "--positions", "p.csv"])
+    told = run("small.toml", "air.tif", "-o", "found.toml")
+    assert "sources in air, behind 2 mm of n = 1.52; if they were in a sample: --sample gel" in told.stdout
+    found = gs.read_design("found.toml")
+    assert found.samples == gs.read_design("small.toml").samples
+    assert found.imaging.sensor_distance_mm == pytest.approx(float(actual.sensor_distance), abs=5e-3)
+    held = ("--hold", "sensor_distance,rotation,shift,tilt", "--fit", "sample_at,sample_index")
+    told = run("found.toml", "gel.tif", "--sample", "gel", *held, "-o", "gel.toml")
+    assert "sources in n = 1.4" in told.stdout and "sample_index" in told.stdout
+    new = gs.read_design("gel.toml")
+    # It moves by eight times the error of the sensor's distance.
+    assert new.samples["gel"].surface_mm == pytest.approx(17.0, abs=0.05)
+    assert new.samples["gel"].refractive_index == pytest.approx(1.43, abs=0.01)
+    assert new.imaging == found.imaging and new.sample == found.sample

@@ -101,12 +101,9 @@ def test_depths_include_the_stop_only_when_it_falls_on_the_step(text, count):
     assert len(parse_depths(text)) == count
 
 
-POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"
-
-
 @pytest.mark.integration
 def test_simulate_points(folder, run):
-    (folder / "points.csv").write_text(POINTS)
+    (folder / "points.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n")
     command = ("simulate", "points.csv", "design.toml", "-o", "c.tif")
     status, out, err = run(*command)
     assert (status, err) == (0, "") and out.startswith("c.tif: 96 x 80 pixels, uint16, from 1")
@@ -116,24 +113,6 @@ def test_simulate_points(folder, run):
     np.testing.assert_array_equal(read_capture(folder / "c.tif"), first)
     run(*command, "--seed", "1")
     assert (read_capture(folder / "c.tif") != first).any()
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("x,y,z\n1,2,3\n", "got 'x,y,z'"),
-        ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm must be above 0, got -20.0"),
-        ("x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
-        (None, "gs-jax: voxels must not be negative, got -1 (scene.ome.tif).\n"),
-    ],
-)
-def test_wrong_scenes_give_one_line_and_status_2(folder, run, content, words):
-    write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
-    (folder / "points.csv").write_text(content or "")
-    scene = "points.csv" if content else "scene.ome.tif"
-    status, out, err = run("simulate", scene, "design.toml", "-o", "c.tif")
-    assert (status, out) == (2, "") and not (folder / "c.tif").exists()
-    assert re.fullmatch(r"gs-jax: [^\n]*\n", err) and scene in err and words in err
 
 
 @pytest.mark.integration
@@ -285,13 +264,25 @@ def test_wrong_arguments_give_one_line_and_status_2(folder, run, arguments, word
         ("design.toml", DESIGN.replace("[96, 80]", "[96, 81]"), "capture.tif"),
         ("capture.tif", "not an image", "capture.tif"),
         ("capture.tif", "", "capture.tif"),
+        ("points.csv", "x,y,z\n1,2,3\n", "got 'x,y,z'"),
+        (
+            "points.csv",
+            "x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n",
+            "point 1, z_mm must be above 0, got -20.0",
+        ),
+        ("points.csv", "x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
+        ("scene.ome.tif", None, "gs-jax: voxels must not be negative, got -1 (scene.ome.tif).\n"),
     ],
 )
 def test_wrong_files_give_one_line_and_status_2(folder, run, name, content, words):
-    (folder / name).write_text(content)
-    status, out, err = run(*RECONSTRUCT, "-o", "v.tif")
-    assert (status, out) == (2, "") and not (folder / "v.tif").exists()
-    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err
+    write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
+    if content is not None:
+        (folder / name).write_text(content)
+    simulates = name in ("points.csv", "scene.ome.tif")
+    command = ("simulate", name, "design.toml") if simulates else RECONSTRUCT
+    status, out, err = run(*command, "-o", "made.tif")
+    assert (status, out) == (2, "") and not (folder / "made.tif").exists()
+    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err and (name in err or not simulates)
 
 
 def test_an_internal_fault_is_not_swallowed(folder, monkeypatch):

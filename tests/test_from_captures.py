@@ -15,7 +15,7 @@ from gs_jax.reconstruction.radius_fit import RadiusFit, with_radii
 from gs_jax.solvers.unrolled import initialize_unrolled
 
 from .helpers import DESIGN
-from .test_cross_validation import GRID, exposed, scope
+from .test_reconstruction import GRID, exposed, scope
 
 
 @pytest.mark.integration

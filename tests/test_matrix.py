@@ -35,7 +35,7 @@ from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 from gs_jax.reconstruction.plan import follow_volume
 from gs_jax.reconstruction.radius_fit import fit_radius
 
-from .test_calibration_pattern import discs
+from .test_calibration import discs
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "design").glob("*.toml"))
 LENSES, PIXELS = 24, 600

@@ -5,6 +5,7 @@ import inspect
 from contextlib import contextmanager
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
 
 import gs_jax as gs
 from gs_jax import Grid, ImagingOperator, backproject, forward, psf_model
@@ -21,11 +24,12 @@ from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.reconstruction.inverse_problem import discrepancy_target, noise_variance, prepare_data, prepare_model
 from gs_jax.reconstruction.pipeline import METHODS, BackProjection, PinholeRichardsonLucy, reconstruct, voxel_grid
-from gs_jax.reconstruction.residual import forward_residual
+from gs_jax.reconstruction.radius_fit import _bounds, _middle, fit_radius, with_radii
+from gs_jax.reconstruction.residual import folds_of_lenses, forward_residual, kept_pixels_of_folds
 from gs_jax.simulation.synthetic import simulate_volume
 from gs_jax.solvers.base import solve
 from gs_jax.solvers.fista import FISTA
-from gs_jax.solvers.richardson_lucy import RichardsonLucy, kl_divergence
+from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, kl_divergence
 
 from .helpers import compilations, scene
 
@@ -299,3 +303,203 @@ def test_a_step_of_a_reconstructor_is_differentiated():
     weight = jax.random.normal(jax.random.key(0), lucy.problem.in_structure().shape)
     moment = jax.jit(lambda image: jnp.vdot(weight, lucy.finish(lucy.step(lucy.init(image)))))
     check_grads(moment, (jnp.asarray(image),), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)
+
+
+# Lenses predicted from the others: what is left out is not read, and the score ranks volumes as the truth does.
+
+
+GRID = gs.Grid(np.array([19.0, 20.0, 21.0]), (31, 31), 0.08)
+
+
+def scope() -> gs.Imager:
+    array = gs.MicrolensArray(gs.random_layout(25, (5.0, 5.0), seed=0), 2.0, 1.43, 1.0, 1.0)
+    return gs.Imager(array, gs.Sensor((125, 125), 0.04), 5.8, 2.0)
+
+
+@pytest.fixture(scope="module")
+def folds_scene():
+    """Blobs, and their image without noise by one PSF for each depth."""
+    truth = np.where(np.random.default_rng(1).random(GRID.volume_shape) < 0.01, 1.0, 0.0)
+    truth = gaussian_filter(truth, (0, 2.5, 2.5))
+    psf = gs.psf_model(scope(), GRID, "near")
+    return truth, psf, np.asarray(gs.forward(truth, scope(), GRID, psf), np.float64)
+
+
+def exposed(clean: np.ndarray, electrons: float) -> np.ndarray:
+    rng = np.random.default_rng(2)
+    return rng.poisson(np.maximum(clean, 0) * electrons / clean.max()) + rng.normal(0, 2, clean.shape)
+
+
+def test_neighbours_are_left_out_in_turn():
+    centers = np.asarray(gs.random_layout(60, (8.0, 8.0), seed=3))
+    folds = folds_of_lenses(centers, 4)
+    assert np.bincount(folds, minlength=4).min() >= 10
+    nearest = np.asarray(KDTree(centers).query(centers, 2)[1])[:, 1]
+    assert np.mean(folds == folds[nearest]) < 0.1
+    kept = kept_pixels_of_folds(scope(), 4)
+    np.testing.assert_array_equal(sum(1 - each for each in kept), 1)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_back_projection_is_scored_as_it_is(folds_scene, normalize):
+    """With all pixels it is the volume that is asked for, divided by the weights or not; the scores differ."""
+    _, psf, clean = folds_scene
+    volume_of = gs.Reconstructor(scope(), GRID, gs.BackProjection(normalize=normalize), psf)
+    whole = volume_of(clean)
+    np.testing.assert_allclose(volume_of.keeping(np.ones_like(clean))(clean), whole, rtol=1e-6, atol=1e-7)
+    weights = gs.backproject(np.ones_like(clean), scope(), GRID)
+    other = gs.Reconstructor(scope(), GRID, gs.BackProjection(normalize=not normalize), psf)(clean)
+    factor = 1 / np.maximum(weights, 1e-6) if normalize else np.asarray(weights)
+    np.testing.assert_allclose(whole, other * factor, rtol=1e-4, atol=1e-5)
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.integration) for name in ("list-rl", "fista", "admm", "unrolled")]
+
+
+@pytest.mark.parametrize("name", ["backproject", "richardson-lucy", *SLOW])
+def test_what_is_left_out_is_not_read(folds_scene, name):
+    _, psf, clean = folds_scene
+    image, kept = exposed(clean, 2000), kept_pixels_of_folds(scope(), 3)[0]
+    prepared = gs.Reconstructor(scope(), GRID, METHODS[name](4), psf)
+    # With all pixels kept, the program is that of some.
+    volume_of, all_of = prepared.keeping(kept), prepared.keeping(np.ones_like(kept))
+    # More light, so that the percentile that counts as dark is the same.
+    lit = image + np.where(kept == 0, 500.0, 0.0)
+    volume, other, whole = volume_of(image), volume_of(lit), all_of(lit)
+    np.testing.assert_array_equal(volume, other)
+    assert np.abs(volume - whole).max() > 0.1 * volume.max() > 0
+
+
+@pytest.mark.integration
+def test_the_score_ranks_as_the_truth_does(folds_scene):
+    """Steps of Richardson-Lucy on a noisy capture: too few, some, and so many that they fit the noise."""
+    truth, psf, clean = folds_scene
+    image = exposed(clean, 200)
+    methods = [RichardsonLucy(steps, background=3.0, accelerate=True) for steps in (1, 12, 60)]
+    scores = [gs.cross_validated(image, scope(), GRID, each, optics=psf, folds=3) for each in methods]
+    volumes = [gs.reconstruct(image, scope(), GRID, each, optics=psf) for each in methods]
+    by_truth = [gs.quality(volume, truth).psnr_db for volume in volumes]
+    assert np.argmax(by_truth) == np.argmax([score.score_db for score in scores]) == 1
+    # What was fitted only gets better.
+    seen = [gs.forward_residual(volume, image, scope(), GRID, optics=psf).error for volume in volumes]
+    assert seen[2] < seen[1] < seen[0]
+    # A perfect volume leaves the noise.
+    assert all(score.error > score.noise > 0 for score in scores)
+
+
+def test_a_background_is_the_mean_over_kept_pixels():
+    kept = np.ones((40, 30))
+    kept[:, ::3] = 0
+    step = jax.jit(background_step)
+    np.testing.assert_allclose(np.asarray(step(np.ones((2, 2)), 2 * kept, kept)), 2, rtol=1e-12)
+
+
+def test_darkness_and_what_is_refused(folds_scene):
+    _, psf, _ = folds_scene
+    dark = np.zeros((125, 125))
+    found = gs.cross_validated(dark, scope(), GRID, optics=psf)
+    assert found.error == found.noise == 0 and np.isfinite(found.regions).all()
+    one = gs.Imager(gs.MicrolensArray([[0.0, 0.0]]), gs.Sensor((125, 125), 0.04), 5.8, 2.0)
+    wrong: Any = 2.5
+    for imager, method, folds, words in (
+        (one, gs.BackProjection(), 2, "2 or more lenses"),
+        (scope(), gs.BackProjection(), 26, "folds must be 2 to 25"),
+        (scope(), gs.BackProjection(), wrong, "folds must be 2 to 25"),
+        (scope(), gs.Surface(), 4, "got Surface"),
+    ):
+        with pytest.raises(gs.InputError, match=words):
+            gs.cross_validated(dark, imager, GRID, method, optics=psf, folds=folds)
+
+
+# The radius that predicts lenses best is nearer to that of the device, and a device as designed is left alone.
+
+
+RADIUS_GRID = gs.Grid([19.0, 20.0, 21.0], (41, 41), 0.1)
+
+
+def radius_scope(radius: float = 2.0) -> gs.Imager:
+    array = gs.MicrolensArray(gs.random_layout(16, (4.0, 4.0), seed=0), radius, 1.43, 1.4, 1.0)
+    return gs.Imager(array, gs.Sensor((200, 200), 0.02), 5.8, 2.0)
+
+
+def captures(imager: gs.Imager) -> list[np.ndarray]:
+    """Of short lines, far finer than voxels, with noise."""
+    images = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        ends = np.column_stack([rng.uniform(-1.2, 1.0, (8, 2)), rng.uniform(19, 21, 8)])
+        along = np.linspace(0, 0.6, 80)[:, None] * np.array([1.0, 0.3, 0.0])
+        lines = (ends[:, None] + along).reshape(-1, 3)
+        clean = np.asarray(gs.simulate(np.column_stack([lines, np.ones(len(lines))]), imager), np.float64)
+        images.append(rng.poisson(clean * 2000 / clean.max()) + rng.normal(0, 2, clean.shape))
+    return images
+
+
+# Nearer to the true factor than 1 is: the fit may be 1 to 2 % off.
+@pytest.mark.integration
+@pytest.mark.parametrize("true, least, most", [(1.03, 1.01, 1.04), (1.0, 1.0, 1.0)])
+def test_the_radius_comes_nearer_to_the_device(true, least, most):
+    found = fit_radius(captures(radius_scope(2 * true)), radius_scope(), RADIUS_GRID, METHODS["list-rl"](20))
+    assert least <= found.factor <= most
+    np.testing.assert_allclose(found.imager.array.radius_of_curvature, 2 * found.factor, rtol=1e-6)
+    assert dict(found.trials)[found.factor] == min(dict(found.trials).values()) or found.factor == 1
+
+
+def test_all_lenses_change_by_one_factor():
+    array = dataclasses.replace(radius_scope().array, radius_of_curvature=np.linspace(1.5, 2.5, 16))
+    typed = dataclasses.replace(radius_scope(), array=array)
+    np.testing.assert_allclose(with_radii(typed, 1.1).array.radius_of_curvature, np.linspace(1.65, 2.75, 16), 1e-6)
+    thin = dataclasses.replace(
+        radius_scope(), array=dataclasses.replace(radius_scope().array, thin_lens_focal_length=4.0)
+    )
+    np.testing.assert_allclose(with_radii(thin, 0.9).array.focal_length, 3.6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change, least, most",
+    [
+        ({"conic_constant": 3.0}, 0.94, 1.06),
+        ({"aperture_diameter": 3.9}, 0.98, 1.06),
+        ({"aspheric_terms": [-0.265]}, 0.94, 1.02),
+        ({"aperture_diameter": 5.0}, 1.0, 1.0),
+    ],
+)
+def test_surfaces_still_fall_outward_to_the_edges_of_their_apertures(change, least, most):
+    one = dataclasses.replace(radius_scope(), array=dataclasses.replace(radius_scope().array, **change))
+    np.testing.assert_allclose(_bounds(one), (least, most), atol=1e-9)
+
+
+@pytest.mark.integration
+def test_captures_without_light_are_not_counted():
+    dark = np.zeros((200, 200))
+    found = fit_radius([dark], radius_scope(), RADIUS_GRID, METHODS["list-rl"](1), optics="near")
+    assert found.factor == 1 and {error for _, error in found.trials} == {0.0}
+
+
+@pytest.mark.parametrize(
+    "images, method, said",
+    [
+        ([], "list-rl", "a capture or more"),
+        ([np.zeros((200, 201))], "list-rl", "the sensor's shape"),
+        ([np.zeros((200, 200))], "surface", "free voxels"),
+    ],
+)
+def test_wrong_input(images, method, said):
+    with pytest.raises(gs.InputError, match=said):
+        fit_radius(images, radius_scope(), RADIUS_GRID, METHODS[method](10))
+
+
+@pytest.mark.parametrize("radius, pitch, binning, margin", [(2.0, 0.1, 3, 0), (0.5, 0.01, 1, 34)])
+def test_the_middle_keeps_its_place(radius, pitch, binning, margin):
+    """A marked pixel of an oblong sensor beside the axis is where the sensor of the middle says."""
+    one = dataclasses.replace(radius_scope(), field_radius=radius, sensor=gs.Sensor((200, 230), 0.02, (0.3, -0.2)))
+    part, grid, cut, judged = _middle(one, RADIUS_GRID.depths, pitch)
+    rows, columns = part.sensor.shape
+    assert round(part.sensor.pixel_pitch / 0.02) == binning and grid.origin.tolist() == list(part.sensor.origin)
+    assert judged.sum() == (rows - 2 * margin) * (columns - 2 * margin)
+    image = np.zeros(one.sensor.shape, np.float32)
+    image[107, 101] = 1
+    found = np.asarray(part.sensor.to_mm(np.argwhere(cut(image))[0]))
+    # Within a pixel of the middle.
+    half = 0.01 * (binning - 1)
+    np.testing.assert_allclose(found, one.sensor.to_mm(np.array([107, 101])), atol=half + 1e-6)
