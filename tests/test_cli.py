@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from gs_jax import Grid
+import gs_jax as gs
 from gs_jax.__main__ import main
 from gs_jax.cli.options import parse_depths
-from gs_jax.design.design import read_design
-from gs_jax.io.captures import read_capture
-from gs_jax.io.point_tables import read_points
 from gs_jax.io.provenance import SCORE, read_provenance
-from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import DESIGN, needs
 
@@ -26,7 +22,7 @@ def test_reconstruct(folder, run, name):
     status, out, err = run(*RECONSTRUCT, "--voxel-um", "50", "-o", name)
     assert (status, err) == (0, "")
     assert "9 x 39 x 33 voxels (z, y, x), 50 um laterally, 9 depths from 18 to 22 mm" in out
-    volume, grid = read_volume(folder / name)
+    volume, grid = gs.read_volume(folder / name)
     assert volume.shape == (9, 39, 33) and grid.pitch == pytest.approx(0.05)
     np.testing.assert_allclose(grid.depths, np.arange(18, 22.1, 0.5))
     assert volume.max() > 7  # several lenses see the middle
@@ -37,17 +33,17 @@ def test_reconstruct(folder, run, name):
 def test_the_papers_clusters(folder, run):
     """The brightest voxels of connected groups, here of one point seen by four lenses; in the volume and as a table."""
     image = np.full((96, 80), 16, np.uint16)
-    scope = read_design(folder / "design.toml").imager()
+    scope = gs.read_design(folder / "design.toml").imager()
     for row, column in np.asarray(scope.sensor.to_pixels(scope.project(np.array([[0.0, 0.0, 20.0]]))))[:, 0]:
         image[round(row) - 1 : round(row) + 2, round(column) - 1 : round(column) + 2] = 1000
     tifffile.imwrite(folder / "capture.tif", image)
     options = ("--voxel-um", "50", "--suppress", "clusters", "-o", "v.tif", "--points", "p.csv")
     status, out, err = run(*RECONSTRUCT, *options)
-    found = read_points(folder / "p.csv")
+    found = gs.read_points(folder / "p.csv")
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
     # A voxel off at most; of four lenses within 0.45 mm the parallax over these depths is less than a spot.
     assert np.abs(found[0, :2]).max() < 0.051
-    volume, _ = read_volume(folder / "v.tif")
+    volume, _ = gs.read_volume(folder / "v.tif")
     assert volume.sum() == pytest.approx(found[:, 3].sum(), rel=1e-5)
 
 
@@ -60,10 +56,10 @@ def test_points_of_a_capture(folder, run):
     options = "--depths 19:21:0.25 --voxel-um 20 --suppress points -o v.tif --points p.csv".split()
     status, out, err = run("reconstruct", "capture.tif", "design.toml", *options)
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
-    found = read_points(folder / "p.csv")[0]
+    found = gs.read_points(folder / "p.csv")[0]
     # Four lenses within 0.45 mm: a pixel of parallax is 0.7 mm of depth, and a third of one is left.
     assert np.hypot(found[0] - 0.02, found[1] + 0.01) < 0.003 and abs(found[2] - 20) < 0.25
-    volume, grid = read_volume(folder / "v.tif")
+    volume, grid = gs.read_volume(folder / "v.tif")
     assert volume.sum() == pytest.approx(found[3], rel=1e-5)
 
 
@@ -74,7 +70,7 @@ def test_a_surface_has_maps_beside_its_volume(folder, run):
     status, out, _ = run(*RECONSTRUCT[:4], *options)
     assert status == 0 and "m.ome.tif: sheets leave" in out and ", one more " in out
     brightness, depth, _ = tifffile.imread(folder / "m.ome.tif")
-    volume, _ = read_volume(folder / "v.tif")
+    volume, _ = gs.read_volume(folder / "v.tif")
     np.testing.assert_allclose(volume.sum(0), brightness, rtol=1e-3, atol=1e-6 * brightness.max())
     assert (np.nan_to_num(depth, nan=2e4) >= 18_000).all() and (np.nan_to_num(depth, nan=2e4) <= 22_000).all()
 
@@ -107,27 +103,27 @@ def test_simulate_points(folder, run):
     command = ("simulate", "points.csv", "design.toml", "-o", "c.tif")
     status, out, err = run(*command)
     assert (status, err) == (0, "") and out.startswith("c.tif: 96 x 80 pixels, uint16, from 1")
-    first = read_capture(folder / "c.tif", (96, 80))
+    first = gs.read_capture(folder / "c.tif", (96, 80))
     assert abs(int(first.max()) - 1016) < 150  # 10,000 electrons, 10 a count, an offset of 16
     run(*command)
-    np.testing.assert_array_equal(read_capture(folder / "c.tif"), first)
+    np.testing.assert_array_equal(gs.read_capture(folder / "c.tif"), first)
     run(*command, "--seed", "1")
-    assert (read_capture(folder / "c.tif") != first).any()
+    assert (gs.read_capture(folder / "c.tif") != first).any()
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("optics", [(), ("--optics", "near", "--psf", "gaussian")], ids=["full", "near"])
 def test_simulate_a_volume_and_reconstruct_it(optics, folder, run):
-    grid = Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
+    grid = gs.Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
     voxels = np.zeros((3, 9, 9), np.float32)
     voxels[1, 6, 3] = 1
-    write_volume(folder / "scene.zarr", voxels, grid)
+    gs.write_volume(folder / "scene.zarr", voxels, grid)
     simulate = ("simulate", "scene.zarr", "design.toml", *optics, "--no-noise", "-o", "capture.tif")
     status, out, _ = run(*simulate)
     assert status == 0 and "float32, from " in out
     options = ("--depths", "20:20:1", "--voxel-um", "50", "-o", "v.tif")
     run("reconstruct", "capture.tif", "design.toml", *options)
-    volume, found = read_volume(folder / "v.tif")
+    volume, found = gs.read_volume(folder / "v.tif")
     _, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
     assert abs(float(found.y[row]) - 0.1) < 0.06 and abs(float(found.x[column]) + 0.05) < 0.06  # a voxel
 
@@ -275,7 +271,7 @@ def test_wrong_arguments_give_one_line_and_status_2(folder, run, arguments, word
     ],
 )
 def test_wrong_files_give_one_line_and_status_2(folder, run, name, content, words):
-    write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
+    gs.write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), gs.Grid([20.0], (3, 3), 0.05))
     if content is not None:
         (folder / name).write_text(content)
     simulates = name in ("points.csv", "scene.ome.tif")
@@ -331,7 +327,7 @@ def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, run):
         pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]  # pyright: ignore[reportArgumentType]
     assert pixels["PhysicalSizeX"] == pytest.approx(20) and pixels["PhysicalSizeXUnit"] in ("µm", "\u03bcm")
     assert pixels["PhysicalSizeZ"] == pytest.approx(50)
-    volume, grid = read_volume(output)
+    volume, grid = gs.read_volume(output)
     z, y, x = np.unravel_index(int(volume.argmax()), volume.shape)
     assert abs(float(grid.depths[z]) - 20) <= 0.1
     assert np.hypot(float(grid.x[x]), float(grid.y[y])) <= 0.02
@@ -345,10 +341,10 @@ def test_demo(tmp_path, run):
     assert made >= {"design.toml", "optimized.toml", "words.tif", "words.ome.tif", "points-found.csv", "mold.stl"}
     page = (tmp_path / "demo" / "report.html").read_text()
     assert 1e6 < len(page) < 15e6 and str(tmp_path) not in page
-    assert len(read_points(tmp_path / "demo" / "points-found.csv")) == pytest.approx(60, abs=2)
+    assert len(gs.read_points(tmp_path / "demo" / "points-found.csv")) == pytest.approx(60, abs=2)
     report = (tmp_path / "demo" / "report.md").read_text()
     assert all(name in made for name in re.findall(r"!\[.*\]\((.*)\)", report)) and "NO" not in report
-    volume, grid = read_volume(tmp_path / "demo" / "words.ome.tif")
+    volume, grid = gs.read_volume(tmp_path / "demo" / "words.ome.tif")
     # Each word is brightest on its own plane: at 18, 20 and 22 mm.
     for depth, (x, y) in ((18, (-4, -5)), (20, (0, 0)), (22, (4, 5))):
         near = np.ix_(abs(np.asarray(grid.y) - y) < 1.5, abs(np.asarray(grid.x) - x) < 4)

@@ -173,22 +173,9 @@ def test_an_infinite_plate_has_no_density():
 
 
 BY_DEPTH = (
-    "lenses_per_point",
-    "occupancy",
-    "coverage",
-    "depth_of_field",
-    "approximate_depth_of_field",
-    "near_limit",
-    "far_limit",
-    "focus_distance",
-    "sensor_blur",
-    "blur",
-    "lateral_resolution",
-    "axial_resolution",
-    "light",
-    "field_of_view",
-    "log_strehl",
-)
+    "lenses_per_point occupancy coverage depth_of_field approximate_depth_of_field near_limit far_limit focus_distance "
+    "sensor_blur blur lateral_resolution axial_resolution light field_of_view log_strehl"
+).split()
 
 
 @pytest.mark.integration

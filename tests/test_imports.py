@@ -11,36 +11,10 @@ from gs_jax.io.files import _temporary_beside
 ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "gs_jax").rglob("*.py"))
 # Whatever stands here imports from what stands before it.
-ORDER = [
-    "_version",
-    "typing",
-    "base",
-    "linear",
-    "lenses",
-    "layers",
-    "materials",
-    "grid",
-    "geometry",
-    "metrics",
-    "layouts",
-    "optics",
-    "objectives",
-    "projection",
-    "interop",
-    "io",
-    "simulation",
-    "design",
-    "solvers",
-    "detection",
-    "calibration",
-    "reconstruction",
-    "codesign",
-    "mold",
-    "apps",
-    "cli",
-    "widget",
-    "__main__",
-]
+ORDER = (
+    "_version typing base linear lenses layers materials grid geometry metrics layouts optics objectives projection "
+    "interop io simulation design solvers detection calibration reconstruction codesign mold apps cli widget __main__"
+).split()
 
 
 def imported(path: Path, root: Path = ROOT) -> Iterator[list[str]]:

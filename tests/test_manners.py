@@ -15,17 +15,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+import gs_jax as gs
 from gs_jax.__main__ import COMMANDS, commands, interrupt_message
 from gs_jax.cli import options
 from gs_jax.cli.commands import RESUMABLE
 from gs_jax.cli.reconstruct import deconvolve_command
-from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
-from gs_jax.grid import Grid
-from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
-from gs_jax.io.point_tables import write_points
-from gs_jax.io.volumes import write_volume
 from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
 from gs_jax.mold.heights import HEIGHT_SUFFIXES, write_heights
 from gs_jax.optics.psf import PSFS
@@ -134,7 +130,7 @@ def small_disk(tmp_path_factory):
 
 
 NOISE = np.random.default_rng(0).random((2, 99, 99), np.float32)
-GRID = Grid([18.0, 20.0], NOISE.shape[1:], 0.1)
+GRID = gs.Grid([18.0, 20.0], NOISE.shape[1:], 0.1)
 MESH = Mesh(NOISE.reshape(-1, 3)[:999], np.arange(999).reshape(-1, 3))
 CIRCLES = np.column_stack([np.arange(999), np.zeros(999), np.full(999, 0.5)])
 MASK = Mask(np.array([[-1.0, -1.0], [999.0, -1.0], [999.0, 1.0], [-1.0, 1.0]]), CIRCLES, [], [])
@@ -147,13 +143,13 @@ def _picture(path):
 
 
 WRITERS = {
-    "v.ome.tif": lambda path: write_volume(path, NOISE, GRID),
-    "v.zarr": lambda path: write_volume(path, NOISE, GRID),
-    "c.tif": lambda path: write_capture(path, NOISE[0]),
-    "c.png": lambda path: write_capture(path, NOISE[0].view(np.uint16)),
-    "c.npy": lambda path: write_capture(path, NOISE[0]),
-    "p.csv": lambda path: write_points(path, 1 + NOISE.reshape(-1, 6)[:, :4]),
-    "d.toml": lambda path: write_design(path, read_design(ROOT / "design" / "geomscope.toml")),
+    "v.ome.tif": lambda path: gs.write_volume(path, NOISE, GRID),
+    "v.zarr": lambda path: gs.write_volume(path, NOISE, GRID),
+    "c.tif": lambda path: gs.write_capture(path, NOISE[0]),
+    "c.png": lambda path: gs.write_capture(path, NOISE[0].view(np.uint16)),
+    "c.npy": lambda path: gs.write_capture(path, NOISE[0]),
+    "p.csv": lambda path: gs.write_points(path, 1 + NOISE.reshape(-1, 6)[:, :4]),
+    "d.toml": lambda path: gs.write_design(path, gs.read_design(ROOT / "design" / "geomscope.toml")),
     "w.npz": lambda path: write_weights(path, pretrained("paper")),
     "f.png": _picture,
     "r.html": lambda path: write_text(path, 9999 * "r", [".html"]),
@@ -340,7 +336,7 @@ def test_the_camera_of_simulate_is_free(folder, run, monkeypatch):
     monkeypatch.chdir(folder)
     status, _, err = run("simulate", "scene.csv", "design.toml", *options, "-o", "c8.tif")
     assert status == 0, err
-    counts = read_capture(folder / "c8.tif")
+    counts = gs.read_capture(folder / "c8.tif")
     # 900 electrons of 20 a count, on an offset of 7.
     assert counts.dtype == np.uint8 and counts.min() == 7 and counts.max() == 52
 

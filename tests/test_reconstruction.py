@@ -17,19 +17,14 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 import gs_jax as gs
-from gs_jax import Grid, ImagingOperator, backproject, forward, psf_model
 from gs_jax.apps.benchmark import skip_reason
-from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.reconstruction.inverse_problem import discrepancy_target, noise_variance, prepare_data, prepare_model
-from gs_jax.reconstruction.pipeline import METHODS, BackProjection, PinholeRichardsonLucy, reconstruct, voxel_grid
+from gs_jax.reconstruction.pipeline import METHODS, voxel_grid
 from gs_jax.reconstruction.radius_fit import _bounds, _middle, fit_radius, with_radii
-from gs_jax.reconstruction.residual import folds_of_lenses, forward_residual, kept_pixels_of_folds
+from gs_jax.reconstruction.residual import folds_of_lenses, kept_pixels_of_folds
 from gs_jax.simulation.synthetic import simulate_volume
-from gs_jax.solvers.base import solve
-from gs_jax.solvers.fista import FISTA
-from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, kl_divergence
+from gs_jax.solvers.richardson_lucy import background_step, kl_divergence
 
 from .helpers import compilations, scene
 
@@ -40,16 +35,16 @@ def small():
     imager, grid = scene(voxels=(9, 8), pitch=0.1, depths=(18.0, 20.0))
     psf = jnp.zeros((2, 3, 3)).at[:, 1, 1].set(1.0)
     truth = jnp.zeros(grid.volume_shape).at[1, 4, 3].set(1.0)
-    return imager, grid, psf, truth, ImagingOperator(imager, grid, psf).mv(truth)
+    return imager, grid, psf, truth, gs.ImagingOperator(imager, grid, psf).mv(truth)
 
 
 @cache
 def in_one_loop():
     imager, grid, psf, *_ = small()
-    return jax.jit(lambda b: solve(ImagingOperator(imager, grid, psf), b, FISTA(steps=7)).value)
+    return jax.jit(lambda b: gs.solve(gs.ImagingOperator(imager, grid, psf), b, gs.FISTA(steps=7)).value)
 
 
-class Log(Progress):
+class Log(gs.Progress):
     """What is shown, as a list; the work is interrupted after so many parts."""
 
     def __init__(self, most=1000):
@@ -71,14 +66,14 @@ def test_every_method_shows_the_voxel_and_compiles_once(name, caplog):
     """The second call compiles nothing, with another image and for another number of steps, too."""
     imager, grid, psf, truth, image = small()
     image = np.asarray(image)
-    first = reconstruct(image, imager, grid, METHODS[name](10), optics=psf)
+    first = gs.reconstruct(image, imager, grid, METHODS[name](10), optics=psf)
     assert first.dtype == np.float32 and first.shape == grid.volume_shape
     assert int(first.argmax()) == int(truth.argmax())
     with jax.log_compiles(), caplog.at_level("WARNING"):
         jax.jit(lambda x: x + 1)(image)
         assert [r for r in caplog.records if "Compiling" in r.getMessage()]  # as JAX words it
         caplog.clear()
-        second = reconstruct(2 * image, imager, grid, METHODS[name](11), optics=psf)
+        second = gs.reconstruct(2 * image, imager, grid, METHODS[name](11), optics=psf)
     assert not [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
     assert not np.array_equal(first, second)
 
@@ -86,7 +81,7 @@ def test_every_method_shows_the_voxel_and_compiles_once(name, caplog):
 @pytest.mark.integration
 def test_it_is_what_the_solver_finds_in_one_loop():
     imager, grid, psf, _, image = small()
-    found = reconstruct(image, imager, grid, FISTA(steps=7), optics=psf)
+    found = gs.reconstruct(image, imager, grid, gs.FISTA(steps=7), optics=psf)
     np.testing.assert_allclose(found, in_one_loop()(image), rtol=1e-6, atol=1e-9)
 
 
@@ -94,14 +89,14 @@ def test_it_is_what_the_solver_finds_in_one_loop():
 def test_each_step_is_shown_and_can_be_the_last():
     imager, grid, psf, _, image = small()
     log = Log()
-    reconstruct(image, imager, grid, RichardsonLucy(steps=10), optics=psf, progress=log)
+    gs.reconstruct(image, imager, grid, gs.RichardsonLucy(steps=10), optics=psf, progress=log)
     assert log.parts == 10 * [("Iterating", 10)]
     early = Log()
-    reconstruct(image, imager, grid, RichardsonLucy(steps=10, tolerance=0.3), optics=psf, progress=early)
+    gs.reconstruct(image, imager, grid, gs.RichardsonLucy(steps=10, tolerance=0.3), optics=psf, progress=early)
     assert 1 <= len(early.parts) < 9
     interrupted = Log(most=3)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(image, imager, grid, RichardsonLucy(steps=10), optics=psf, progress=interrupted)
+        gs.reconstruct(image, imager, grid, gs.RichardsonLucy(steps=10), optics=psf, progress=interrupted)
     assert len(interrupted.parts) == 3
 
 
@@ -109,12 +104,12 @@ def test_each_step_is_shown_and_can_be_the_last():
 def test_the_cameras_offset_is_taken_off_once():
     imager, grid, psf, _, image = small()
     counts = np.round(1000 * np.asarray(image) / float(image.max()))
-    plain = reconstruct(counts, imager, grid, FISTA(steps=7), optics=psf)
-    offset = reconstruct((counts + 100).astype(np.uint16), imager, grid, FISTA(steps=7), optics=psf)
+    plain = gs.reconstruct(counts, imager, grid, gs.FISTA(steps=7), optics=psf)
+    offset = gs.reconstruct((counts + 100).astype(np.uint16), imager, grid, gs.FISTA(steps=7), optics=psf)
     np.testing.assert_allclose(offset, plain, rtol=1e-6)
     # Read noise about zero is no offset: its darkest percent is negative.
     noisy = counts + np.random.default_rng(0).normal(0, 3, counts.shape)
-    found = reconstruct(noisy, imager, grid, FISTA(steps=7), optics=psf)
+    found = gs.reconstruct(noisy, imager, grid, gs.FISTA(steps=7), optics=psf)
     np.testing.assert_allclose(found, in_one_loop()(noisy), rtol=1e-6, atol=1e-6)
 
 
@@ -124,13 +119,13 @@ def test_list_richardson_lucy_multiplies_by_mean_ratios():
     # Its darkest percent is no light, so nothing is taken off.
     image = 1 + jax.random.uniform(jax.random.key(0), imager.sensor.shape)
     image = image.at[:3].set(0.0)
-    A = ImagingOperator(imager, grid)
+    A = gs.ImagingOperator(imager, grid)
     x = jnp.where(A.T.mv(jnp.ones_like(image)) > 0, 1.0, 0)
     for _ in range(3):
         expected = A.mv(x)
         ratio = jnp.where(expected > 0, image / jnp.where(expected > 0, expected, 1), 0)
-        x = x * backproject(ratio, imager, grid, normalize=True)
-    found = reconstruct(image, imager, grid, PinholeRichardsonLucy(steps=3), optics=None)
+        x = x * gs.backproject(ratio, imager, grid, normalize=True)
+    found = gs.reconstruct(image, imager, grid, gs.PinholeRichardsonLucy(steps=3), optics=None)
     # From another uniform start, whose scale does not matter; the volume is float32.
     np.testing.assert_allclose(found, x, rtol=1e-6)
 
@@ -140,8 +135,8 @@ def test_back_projection_has_its_options_and_all_its_planes():
     imager, grid, *_, image = small()
     many = grid.at(np.linspace(17, 22, 19))  # more than are done at a time
     for interpolation, normalize in (("linear", False), ("nearest", True)):
-        expected = backproject(image, imager, many, method=interpolation, normalize=normalize)
-        found = reconstruct(image, imager, many, BackProjection(interpolation, normalize), optics=None)
+        expected = gs.backproject(image, imager, many, method=interpolation, normalize=normalize)
+        found = gs.reconstruct(image, imager, many, gs.BackProjection(interpolation, normalize), optics=None)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
@@ -150,34 +145,34 @@ def test_the_near_psf_is_that_of_the_rays():
     imager, grid, _, _, image = small()
     kernel = psf_of_depth(imager, np.asarray(grid.depths), "geometric")
     of_rays = jnp.stack([kernel(z) for z in grid.depths])
-    np.testing.assert_array_equal(psf_model(imager, grid, "near").parts[0], of_rays)
+    np.testing.assert_array_equal(gs.psf_model(imager, grid, "near").parts[0], of_rays)
     # By name, what is in all of a square is background; this image is darker than that only where it is dark.
-    found = reconstruct(image, imager, grid, FISTA(steps=7), optics="near")
-    assert int(found.argmax()) == int(reconstruct(image, imager, grid, FISTA(steps=7), optics=of_rays).argmax())
+    found = gs.reconstruct(image, imager, grid, gs.FISTA(steps=7), optics="near")
+    assert int(found.argmax()) == int(gs.reconstruct(image, imager, grid, gs.FISTA(steps=7), optics=of_rays).argmax())
 
 
 def test_wrong_arguments_are_named():
     imager, grid, *_, image = small()
-    with pytest.raises(InputError, match="method must be an object such as .*, got 'fista'"):
-        inspect.unwrap(reconstruct)(image, imager, grid, "fista")  # past the tests' check of annotations
-    with pytest.raises(InputError, match="method must be an object such as .*, got <class .*FISTA'>"):
-        inspect.unwrap(reconstruct)(image, imager, grid, FISTA)
-    with pytest.raises(InputError, match=r"image must have the sensor's shape \(96, 80\), got \(5, 5\)"):
-        reconstruct(np.ones((5, 5)), imager, grid)
-    with pytest.raises(InputError, match="interpolation must be 'linear' or 'nearest', got 'cubic'"):
-        BackProjection(interpolation="cubic")
-    with pytest.raises(InputError, match="steps must be 1 or more, got 0"):
-        PinholeRichardsonLucy(steps=0)
+    with pytest.raises(gs.InputError, match="method must be an object such as .*, got 'fista'"):
+        inspect.unwrap(gs.reconstruct)(image, imager, grid, "fista")  # past the tests' check of annotations
+    with pytest.raises(gs.InputError, match="method must be an object such as .*, got <class .*FISTA'>"):
+        inspect.unwrap(gs.reconstruct)(image, imager, grid, gs.FISTA)
+    with pytest.raises(gs.InputError, match=r"image must have the sensor's shape \(96, 80\), got \(5, 5\)"):
+        gs.reconstruct(np.ones((5, 5)), imager, grid)
+    with pytest.raises(gs.InputError, match="interpolation must be 'linear' or 'nearest', got 'cubic'"):
+        gs.BackProjection(interpolation="cubic")
+    with pytest.raises(gs.InputError, match="steps must be 1 or more, got 0"):
+        gs.PinholeRichardsonLucy(steps=0)
 
 
-@pytest.mark.parametrize("method", [BackProjection(), RichardsonLucy(steps=7)])
+@pytest.mark.parametrize("method", [gs.BackProjection(), gs.RichardsonLucy(steps=7)])
 def test_what_is_not_finite_is_named(method):
     imager, grid, psf, truth, image = small()
     spoilt = image.at[0, :2].set([np.nan, np.inf])
-    with pytest.raises(InputError, match="image must be finite, got 2 of 7680 pixels NaN"):
-        reconstruct(spoilt, imager, grid, method, optics=psf)
-    with pytest.raises(InputError, match="volume must be finite, got 1 of 144 voxels NaN"):
-        forward_residual(truth.at[0, 0, 0].set(np.nan), image, imager, grid, optics=psf)
+    with pytest.raises(gs.InputError, match="image must be finite, got 2 of 7680 pixels NaN"):
+        gs.reconstruct(spoilt, imager, grid, method, optics=psf)
+    with pytest.raises(gs.InputError, match="volume must be finite, got 1 of 144 voxels NaN"):
+        gs.forward_residual(truth.at[0, 0, 0].set(np.nan), image, imager, grid, optics=psf)
 
 
 def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
@@ -185,25 +180,25 @@ def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
     taken = SimpleNamespace(total=2**50, available=2**20)
     monkeypatch.setattr("psutil.virtual_memory", lambda: taken)
     imager, grid, *_ = small()
-    with pytest.raises(InputError, match="GiB of the free memory"):
+    with pytest.raises(gs.InputError, match="GiB of the free memory"):
         voxel_grid(imager, [18.0, 20.0], 0.001)
-    with pytest.raises(InputError, match="GiB that are free"):
-        simulate_volume(np.ones((1, 900, 900), np.float32), imager, Grid([20.0], (900, 900), 0.001))
+    with pytest.raises(gs.InputError, match="GiB that are free"):
+        simulate_volume(np.ones((1, 900, 900), np.float32), imager, gs.Grid([20.0], (900, 900), 0.001))
     assert skip_reason("admm, dense", 30, None, 1e9) is not None
 
 
 @pytest.mark.parametrize("pixels, binning", [(0.5, 1), (1.4, 1), (1.6, 2), (1.99, 2), (2.9, 2), (3.0, 3), (4.2, 4)])
 def test_pixels_are_about_as_wide_as_voxels(pixels, binning):
     imager = scene(shape=(60, 80))[0]
-    grid = Grid([20.0], (11, 13), pixels * imager.sensor.pixel_pitch / float(imager.magnification(20.0)))
-    assert prepare_model(imager, grid, "pinhole", Progress()).binning == binning
+    grid = gs.Grid([20.0], (11, 13), pixels * imager.sensor.pixel_pitch / float(imager.magnification(20.0)))
+    assert prepare_model(imager, grid, "pinhole", gs.Progress()).binning == binning
 
 
 def test_pixels_of_any_number_are_summed():
     """61 and 83 have no common divisor: squares of four pixels, and what is left at the end is left out."""
     imager = scene(shape=(61, 83))[0]
-    grid = Grid([20.0], (11, 13), 4.2 * imager.sensor.pixel_pitch / float(imager.magnification(20.0)))
-    model = prepare_model(imager, grid, "pinhole", Progress())
+    grid = gs.Grid([20.0], (11, 13), 4.2 * imager.sensor.pixel_pitch / float(imager.magnification(20.0)))
+    model = prepare_model(imager, grid, "pinhole", gs.Progress())
     assert model.binning == 4 and model.imager.sensor.shape == (15, 20)
     image = np.random.default_rng(0).random((61, 83)) + 1
     light = prepare_data(image, dataclasses.replace(model, is_partial=False))[0]
@@ -242,16 +237,16 @@ def test_it_is_what_the_truth_has_left(side):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("solver", [RichardsonLucy(steps=100), FISTA(steps=100)])
+@pytest.mark.parametrize("solver", [gs.RichardsonLucy(steps=100), gs.FISTA(steps=100)])
 def test_solvers_end_where_noise_is_left(solver):
     imager, _ = scene()
-    grid = Grid([18.0, 20.0], (9, 8), 0.1)
-    image = np.asarray(forward(jnp.zeros(grid.volume_shape).at[1, 4, 3].set(1.0), imager, grid))
+    grid = gs.Grid([18.0, 20.0], (9, 8), 0.1)
+    image = np.asarray(gs.forward(jnp.zeros(grid.volume_shape).at[1, 4, 3].set(1.0), imager, grid))
     noisy = image + np.random.default_rng(3).normal(0, 0.05 * image.max(), image.shape)
     steps = {}
     for name, capture in (("clean", image), ("noisy", noisy)):
         log = Log()
-        reconstruct(capture, imager, grid, solver, optics=None, stop_at_discrepancy=True, progress=log)
+        gs.reconstruct(capture, imager, grid, solver, optics=None, stop_at_discrepancy=True, progress=log)
         steps[name] = len(log.parts)
     assert steps["noisy"] < 60 < steps["clean"] == 100
 
@@ -260,7 +255,7 @@ def test_solvers_end_where_noise_is_left(solver):
 def test_methods_that_cannot_stop_at_the_noise(method):
     imager, grid = scene()
     for function in (gs.reconstruct, gs.cross_validated):
-        with pytest.raises(InputError, match=rf"must be used with .*, got {type(method).__name__}\(\)"):
+        with pytest.raises(gs.InputError, match=rf"must be used with .*, got {type(method).__name__}\(\)"):
             function(np.ones(imager.sensor.shape), imager, grid, method, stop_at_discrepancy=True)
 
 
@@ -270,11 +265,11 @@ def tiny():
     imager, grid = scene(shape=(40, 50), voxels=(5, 4), pitch=0.2, depths=(18.0, 20.0))
     rng = np.random.default_rng(0)
     # No two pixels are equal: percentiles have derivatives.
-    image = 5 + rng.random(imager.sensor.shape) + forward(rng.random(grid.volume_shape), imager, grid)
+    image = 5 + rng.random(imager.sensor.shape) + gs.forward(rng.random(grid.volume_shape), imager, grid)
     return lambda method: gs.Reconstructor(imager, grid, method, "pinhole"), np.asarray(image)
 
 
-METHODS_OF_JAX = [BackProjection(normalize=True), RichardsonLucy(), PinholeRichardsonLucy(), FISTA()]
+METHODS_OF_JAX = [gs.BackProjection(normalize=True), gs.RichardsonLucy(), gs.PinholeRichardsonLucy(), gs.FISTA()]
 
 
 @pytest.mark.parametrize("method", METHODS_OF_JAX, ids=lambda method: type(method).__name__)
@@ -292,14 +287,14 @@ def test_a_reconstructor_is_compiled_and_mapped(method):
     both = eqx.filter_jit(eqx.filter_vmap(once, in_axes=(None, 0)))(reconstructor, jnp.stack([image, image + 1]))
     np.testing.assert_allclose(both[0], expected, rtol=1e-5, atol=1e-6)
     # The camera's offset is subtracted, but for back-projection, which reads the image as it is.
-    lifted = expected + (expected > 0) * isinstance(method, BackProjection)
+    lifted = expected + (expected > 0) * isinstance(method, gs.BackProjection)
     np.testing.assert_allclose(both[1], lifted, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.integration
 def test_a_step_of_a_reconstructor_is_differentiated():
     make, image = tiny()
-    lucy = make(RichardsonLucy())
+    lucy = make(gs.RichardsonLucy())
     weight = jax.random.normal(jax.random.key(0), lucy.problem.in_structure().shape)
     moment = jax.jit(lambda image: jnp.vdot(weight, lucy.finish(lucy.step(lucy.init(image)))))
     check_grads(moment, (jnp.asarray(image),), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)
@@ -375,7 +370,7 @@ def test_the_score_ranks_as_the_truth_does(folds_scene):
     """Steps of Richardson-Lucy on a noisy capture: too few, some, and so many that they fit the noise."""
     truth, psf, clean = folds_scene
     image = exposed(clean, 200)
-    methods = [RichardsonLucy(steps, background=3.0, accelerate=True) for steps in (1, 12, 60)]
+    methods = [gs.RichardsonLucy(steps, background=3.0, accelerate=True) for steps in (1, 12, 60)]
     scores = [gs.cross_validated(image, scope(), GRID, each, optics=psf, folds=3) for each in methods]
     volumes = [gs.reconstruct(image, scope(), GRID, each, optics=psf) for each in methods]
     by_truth = [gs.quality(volume, truth).psnr_db for volume in volumes]

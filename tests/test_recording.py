@@ -18,19 +18,14 @@ import tifffile
 import zarr
 
 import gs_jax as gs
-from gs_jax import Grid
-from gs_jax.base.errors import InputError, InputWarning
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import read_design
+from gs_jax.base.errors import InputWarning
 from gs_jax.io import ngff, volume_series
 from gs_jax.io.captures import Selection
 from gs_jax.io.names import first_gap, natural_order, plain_text
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.recordings import open_recording, spot_names
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halve
-from gs_jax.io.volumes import read_volume, write_volume
-from gs_jax.projection.backprojection import backproject
-from gs_jax.reconstruction.pipeline import METHODS, reconstruct
+from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.plan import follow_volume
 from gs_jax.reconstruction.recording import PREFETCH, reconstruct_frames
 from gs_jax.widget.layers import reader
@@ -64,7 +59,7 @@ def command(name, *options, output="v.zarr"):
 
 def bead_frames(places):
     """Frames of beads at these x in each, 20 mm deep."""
-    scope = read_design("design.toml").imager()
+    scope = gs.read_design("design.toml").imager()
     frames = np.full((len(places), 96, 80), 16, np.uint16)
     for frame, x in ((frame, x) for frame, row in zip(frames, places, strict=True) for x in row):
         spots = np.asarray(scope.sensor.to_pixels(scope.project(np.array([[x, 0, 20.0]]))))[:, 0]
@@ -92,9 +87,9 @@ def files(path):
 
 
 def expected(frames=FRAMES, **options):
-    grid = Grid.over(read_design("design.toml").imager().sensor, depths=np.arange(18.0, 22.5), pitch=0.05)
-    imager = read_design("design.toml").imager()
-    return np.stack([reconstruct(frame.astype(np.float32), imager, grid, **options) for frame in frames])
+    grid = gs.Grid.over(gs.read_design("design.toml").imager().sensor, depths=np.arange(18.0, 22.5), pitch=0.05)
+    imager = gs.read_design("design.toml").imager()
+    return np.stack([gs.reconstruct(frame.astype(np.float32), imager, grid, **options) for frame in frames])
 
 
 @pytest.mark.integration
@@ -281,7 +276,7 @@ def test_it_is_compiled_once(folder, run):
     frames = FRAMES // 100 + 100
     frames[2, 40, 40] = 65535
     save("rec.tif", frames)
-    jitted: Any = backproject
+    jitted: Any = gs.backproject
     compiled = jitted._cache_size()
     status, out, _ = run(*command("rec.tif", "--voxel-um", "61"))
     assert status == 0 and "1 frame: pixels filled from neighbours" in out
@@ -339,7 +334,7 @@ def test_memory_is_bounded_and_work_overlaps(tmp_path):
         count(1)
         return frame
 
-    grid = Grid([20.0], (4, 4), 0.1)
+    grid = gs.Grid([20.0], (4, 4), 0.1)
     series = Slow(tmp_path / "v.zarr", 30, grid)
     reconstruct_frames(series, read, lambda frame, _: (np.full((1, 4, 4), frame + 1, np.float32), {}, None))
     assert volumes(tmp_path / "v.zarr")[:, 0, 0, 0].tolist() == list(range(1, 31))
@@ -349,7 +344,7 @@ def test_memory_is_bounded_and_work_overlaps(tmp_path):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
 def test_whatever_ends_it_finished_frames_are_kept(tmp_path, error):
-    grid = Grid([20.0], (4, 4), 0.1)
+    grid = gs.Grid([20.0], (4, 4), 0.1)
 
     def make(frame, _):
         if frame == 6:
@@ -360,7 +355,7 @@ def test_whatever_ends_it_finished_frames_are_kept(tmp_path, error):
         reconstruct_frames(VolumeSeries(tmp_path / "v.zarr", 9, grid), lambda frame: frame, make)
     series = VolumeSeries(tmp_path / "v.zarr", 9, grid, resume=True)
     assert series.finished >= set(range(5)) and series.unfinished[-3:] == [6, 7, 8]
-    with pytest.raises(InputError, match="with --resume must be"):
+    with pytest.raises(gs.InputError, match="with --resume must be"):
         VolumeSeries(tmp_path / "v.zarr", 8, grid, resume=True)
 
 
@@ -369,7 +364,7 @@ def test_a_full_disk_names_the_store(tmp_path):
         def __setitem__(self, *_):
             raise OSError(28, "No space left on device")
 
-    grid = Grid([20.0], (4, 4), 0.1)
+    grid = gs.Grid([20.0], (4, 4), 0.1)
     series = VolumeSeries(tmp_path / "v.zarr", 2, grid)
     series.write(0, np.zeros(grid.volume_shape, np.float32))
     series._levels = [Full()]
@@ -533,8 +528,8 @@ def test_text_of_names():
 @pytest.mark.parametrize("suffix", [".ome.tif", ".zarr"])
 def test_volumes_of_any_name(tmp_path, name, suffix):
     path = tmp_path / f"{name}{suffix}"
-    write_volume(path, VOLUME, GRID, {"software": "test"})
-    np.testing.assert_array_equal(read_volume(path)[0], VOLUME)
+    gs.write_volume(path, VOLUME, GRID, {"software": "test"})
+    np.testing.assert_array_equal(gs.read_volume(path)[0], VOLUME)
 
 
 def test_a_recording_of_any_name(folder, run):
@@ -564,7 +559,7 @@ STEPS = 16
 WARM_GRID = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
 
 
-class Counted(Progress):
+class Counted(gs.Progress):
     """Counts the steps of iterations."""
 
     steps = 0
@@ -623,7 +618,7 @@ def test_what_follows_a_dark_frame_starts_afresh(level):
     reconstructor, last = gs.Reconstructor(scope(), WARM_GRID, method, "near"), None
     dark = np.random.default_rng(0).normal(0, level, image.shape).astype(np.float32)
     for frame in (image, dark, image):
-        volume, last = follow_volume(reconstructor, frame, last, Progress())
+        volume, last = follow_volume(reconstructor, frame, last, gs.Progress())
         np.testing.assert_array_equal(volume, alone(frame, method, 4))
 
 
