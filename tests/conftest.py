@@ -25,11 +25,8 @@ import pytest  # noqa: E402
 import tifffile  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from gs_jax.__main__ import main  # noqa: E402
-
 from .browser import browser as browser  # noqa: E402
 from .compilations import CompileBudget  # noqa: E402
-from .helpers import DESIGN  # noqa: E402
 
 # Strict: float64 unless a test says float32, and no silent promotion or broadcasting of ranks.
 jax.config.update("jax_enable_x64", True)
@@ -84,6 +81,9 @@ def _no_machine_is_slow(monkeypatch):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder to work in, with a design and a capture."""
+    # The package is imported after what checks its shapes and types, which pytest starts after this file.
+    from .helpers import DESIGN
+
     monkeypatch.chdir(tmp_path)
     (tmp_path / "design.toml").write_text(DESIGN)
     tifffile.imwrite(tmp_path / "capture.tif", np.full((96, 80), 7, np.uint16))
@@ -93,6 +93,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run a command by its arguments; the exit status, standard output and standard error."""
+    from gs_jax.__main__ import main
 
     def command(*arguments):
         monkeypatch.setattr(sys, "argv", ["gs-jax", *map(str, arguments)])
