@@ -343,6 +343,13 @@ def test_a_scene_that_nobody_knows():
         self_calibrate(blank, start, grid)
 
 
+@pytest.fixture(scope="module")
+def blank():
+    """A design, and noise in its sensor."""
+    _, design, _ = device(0)
+    return design, np.random.default_rng(0).normal(100, 2, design.sensor.shape)
+
+
 UNKNOWN = POINTS[:2] * [[1, 1, np.nan], [1, 1, 1]]
 
 
@@ -372,9 +379,8 @@ UNKNOWN = POINTS[:2] * [[1, 1, np.nan], [1, 1, 1]]
         ),
     ],
 )
-def test_what_cannot_be_calibrated_is_refused_in_words(points, options, message):
-    _, design, _ = device(0)
-    blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
+def test_what_cannot_be_calibrated_is_refused_in_words(blank, points, options, message):
+    design, blank = blank
     images = [blank] * options.get("images", len(points))
     if options.get("lost"):
         images[1] = np.where(blank == blank.max(), np.nan, blank)

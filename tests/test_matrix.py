@@ -286,7 +286,7 @@ def calibrate(case: Case, _) -> None:
     found = gs.calibrate(images, places, start, fit=("sensor_distance", "rotation", "shift"))
     assert found.mirrored == (case.name == "mirrored") and found.rms < 0.5
     # On the host, as in the other tasks: each of JAX's operations alone would be a program.
-    ours, true = (to_numpy(i).project(case.points[:, :3]) for i in (found.imager, case.imager))
+    ours, true = (np.asarray(to_numpy(i).project(case.points[:, :3])) for i in (found.imager, case.imager))
     # What lenses within the field radius see; a mirrored array has its lenses in the same order.
     beside = case.points[None, :, :2] - to_numpy(case.imager).centers[:, None]
     seen = np.linalg.norm(beside, axis=-1) < float(case.imager.field_radius)
@@ -301,7 +301,7 @@ def pattern(case: Case, _) -> None:
     move = 0.02 * host.field_radius * np.array([1, -0.6])
     turned = dataclasses.replace(design, array=array, rotation=host.rotation + 0.5, shift=host.shift + move)
     actual = to_numpy(turned)
-    middles = actual.sensor.to_pixels(actual.project(far)[:, 0])
+    middles = np.asarray(actual.sensor.to_pixels(actual.project(far)[:, 0]))
     radius = 0.3 * float(nearest_neighbour_distances(np.asarray(array.centers)).mean()) / actual.sensor.pixel_pitch
     found = gs.calibrate([discs(actual.sensor.shape, middles, radius)], far, design, fit=PATTERN_FITTED, blurred=[0])
     assert found.mirrored
