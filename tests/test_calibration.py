@@ -361,22 +361,10 @@ UNKNOWN = POINTS[:2] * [[1, 1, np.nan], [1, 1, 1]]
         (UNKNOWN, {"find_lenses": True}, "positions: two or more known points, .*, got 1 of 2 points unknown"),
         (POINTS[:2], {"lost": True}, "capture 2 must be finite, got 1 of .* pixels NaN"),
         (POINTS, {"images": 1}, "positions: .*1 to 1, got a source in capture 2"),
-        (
-            POINTS[:0],
-            {"images": 1},
-            "positions: .*one or more sources, got 0 sources for 1 captures, none in capture 1",
-        ),
-        (np.array([[0.0, 0.0, -20.0]]), {}, "positions: .*depths must be positive, got -20 mm"),
-        (
-            np.array([[0.0, 0.0, np.nan]]),
-            {},
-            "positions: .*no known depth to fit sensor_distance by; give the depth of",
-        ),
-        (
-            np.array([[np.nan, 0.0, 20]]),
-            {},
-            "positions: .*no source with known x and y to fit shift by; give x and y of",
-        ),
+        (POINTS[:0], {"images": 1}, "positions: .*or more sources, got 0 sources for 1 captures, none in capture 1"),
+        ([[0.0, 0.0, -20.0]], {}, "positions: .*depths must be positive, got -20 mm"),
+        ([[0.0, 0.0, np.nan]], {}, "positions: .*no known depth to fit sensor_distance by; give the depth of"),
+        ([[np.nan, 0.0, 20.0]], {}, "positions: .*no source with known x and y to fit shift by; give x and y of"),
     ],
 )
 def test_what_cannot_be_calibrated_is_refused_in_words(blank, points, options, message):
@@ -385,7 +373,7 @@ def test_what_cannot_be_calibrated_is_refused_in_words(blank, points, options, m
     if options.get("lost"):
         images[1] = np.where(blank == blank.max(), np.nan, blank)
     with pytest.raises(gs.InputError, match=message):
-        gs.calibrate(images, points, design, find_lenses=options.get("find_lenses", False))
+        gs.calibrate(images, np.array(points), design, find_lenses=options.get("find_lenses", False))
 
 
 @pytest.mark.integration
