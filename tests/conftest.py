@@ -2,6 +2,7 @@ import ctypes
 import gc
 import math
 import os
+import sys
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -19,9 +20,12 @@ if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and version("jaxlib").sta
     os.environ["XLA_FLAGS"] = f"{flags} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 import jax  # noqa: E402
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+import tifffile  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+from .browser import browser as browser  # noqa: E402
 from .compilations import CompileBudget  # noqa: E402
 
 # Strict: float64 unless a test says float32, and no silent promotion or broadcasting of ranks.
@@ -72,6 +76,32 @@ def _no_machine_is_slow(monkeypatch):
     """What a test reads on standard error is what it asked for, not that a slow machine took ten seconds."""
     monkeypatch.setattr("gs_jax.base.progress._EVERY", math.inf)
     monkeypatch.setattr("gs_jax.base.progress._MEASURED", math.inf)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder to work in, with a design and a capture."""
+    # The package is imported after what checks its shapes and types, which pytest starts after this file.
+    from .helpers import DESIGN
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "design.toml").write_text(DESIGN)
+    tifffile.imwrite(tmp_path / "capture.tif", np.full((96, 80), 7, np.uint16))
+    return tmp_path
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run a command by its arguments; the exit status, standard output and standard error."""
+    from gs_jax.__main__ import main
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["gs-jax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        return stop.value.code, *capsys.readouterr()
+
+    return command
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -29,6 +29,26 @@ from gs_jax.simulation import random_points
 
 from .compilations import compilations as compilations
 
+# A design as a file, of four lenses.
+DESIGN = """
+name = "small"
+[sensor]
+pixel_pitch_um = 20.0
+shape = [96, 80]
+[lens]
+radius_of_curvature_mm = 2.0
+refractive_index = 1.43
+aperture_diameter_mm = 0.4
+[array]
+size_mm = [2.0, 2.0]
+substrate_thickness_mm = 1.0
+centers_mm = [[0.0, 0.0], [0.3, 0.1], [-0.25, 0.2], [0.05, -0.4]]
+[imaging]
+sensor_distance_mm = 5.8
+working_distance_mm = [18.0, 30.0]
+wavelength_nm = 520.0
+field_radius_mm = 0.5
+"""
 # Cropped captures that ship with the tests.
 CAPTURES = Path(__file__).parent / "data"
 # Whole ones, and what others publish, lie beside the repository: too large, or not ours, to ship.

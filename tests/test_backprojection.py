@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 
-from .helpers import backproject_loop, needs, scene
+from .helpers import backproject_loop, scene
 
 # Voxels that are coarser and finer than a pixel: 0.7 pixel, 3 pixels, 1/12 of a pixel apart on the sensor.
 GRIDS = {
@@ -173,20 +173,6 @@ def test_memory_is_image_and_volume_and_a_small_constant():
 def test_wrong_arguments_are_named(call, words):
     with pytest.raises(ValueError, match=words):
         call(*scene())
-
-
-def test_a_ray_traced_point_is_found():
-    """An image that our model did not make; bars of the first milestone: 20 um laterally, 100 um axially."""
-    import tifffile
-
-    image = tifffile.imread(needs("oracle/dev/P1_a.tif"))
-    centers = np.loadtxt(needs("geomscope/centers.csv"), delimiter=",", skiprows=1)
-    imager = Imager(MicrolensArray(centers), Sensor(image.shape, 0.0045), 5.85, 3.0)
-    grid = Grid(np.arange(19.4, 20.61, 0.05), (81, 81), 0.01)
-    volume = np.asarray(backproject(image, imager, grid))
-    depth, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
-    assert abs(float(grid.depths[depth]) - 20) <= 0.1
-    assert np.hypot(float(grid.x[column]), float(grid.y[row])) <= 0.02
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "nearest"])

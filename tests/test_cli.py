@@ -7,65 +7,22 @@ import numpy as np
 import pytest
 import tifffile
 
-from gs_jax import Grid
+import gs_jax as gs
 from gs_jax.__main__ import main
 from gs_jax.cli.options import parse_depths
-from gs_jax.design.design import read_design
-from gs_jax.io.captures import read_capture
-from gs_jax.io.point_tables import read_points
 from gs_jax.io.provenance import SCORE, read_provenance
-from gs_jax.io.volumes import read_volume, write_volume
 
-from .helpers import needs
-
-DESIGN = """
-name = "small"
-[sensor]
-pixel_pitch_um = 20.0
-shape = [96, 80]
-[lens]
-radius_of_curvature_mm = 2.0
-refractive_index = 1.43
-aperture_diameter_mm = 0.4
-[array]
-size_mm = [2.0, 2.0]
-substrate_thickness_mm = 1.0
-centers_mm = [[0.0, 0.0], [0.3, 0.1], [-0.25, 0.2], [0.05, -0.4]]
-[imaging]
-sensor_distance_mm = 5.8
-working_distance_mm = [18.0, 30.0]
-wavelength_nm = 520.0
-field_radius_mm = 0.5
-"""
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder to work in, with a design and a capture."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "design.toml").write_text(DESIGN)
-    tifffile.imwrite(tmp_path / "capture.tif", np.full((96, 80), 7, np.uint16))
-    return tmp_path
-
-
-def run(monkeypatch, capsys, *arguments):
-    """Exit status, standard output and standard error of one command."""
-    monkeypatch.setattr(sys, "argv", ["gs-jax", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    out, err = capsys.readouterr()
-    return stop.value.code, out, err
-
+from .helpers import DESIGN, needs
 
 RECONSTRUCT = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:0.5")
 
 
 @pytest.mark.parametrize("name", ["volume.ome.tif", "volume.zarr"])
-def test_reconstruct(folder, monkeypatch, capsys, name):
-    status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, "--voxel-um", "50", "-o", name)
+def test_reconstruct(folder, run, name):
+    status, out, err = run(*RECONSTRUCT, "--voxel-um", "50", "-o", name)
     assert (status, err) == (0, "")
     assert "9 x 39 x 33 voxels (z, y, x), 50 um laterally, 9 depths from 18 to 22 mm" in out
-    volume, grid = read_volume(folder / name)
+    volume, grid = gs.read_volume(folder / name)
     assert volume.shape == (9, 39, 33) and grid.pitch == pytest.approx(0.05)
     np.testing.assert_allclose(grid.depths, np.arange(18, 22.1, 0.5))
     assert volume.max() > 7  # several lenses see the middle
@@ -73,65 +30,65 @@ def test_reconstruct(folder, monkeypatch, capsys, name):
 
 
 @pytest.mark.integration
-def test_the_papers_clusters(folder, monkeypatch, capsys):
+def test_the_papers_clusters(folder, run):
     """The brightest voxels of connected groups, here of one point seen by four lenses; in the volume and as a table."""
     image = np.full((96, 80), 16, np.uint16)
-    scope = read_design(folder / "design.toml").imager()
+    scope = gs.read_design(folder / "design.toml").imager()
     for row, column in np.asarray(scope.sensor.to_pixels(scope.project(np.array([[0.0, 0.0, 20.0]]))))[:, 0]:
         image[round(row) - 1 : round(row) + 2, round(column) - 1 : round(column) + 2] = 1000
     tifffile.imwrite(folder / "capture.tif", image)
     options = ("--voxel-um", "50", "--suppress", "clusters", "-o", "v.tif", "--points", "p.csv")
-    status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, *options)
-    found = read_points(folder / "p.csv")
+    status, out, err = run(*RECONSTRUCT, *options)
+    found = gs.read_points(folder / "p.csv")
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
     # A voxel off at most; of four lenses within 0.45 mm the parallax over these depths is less than a spot.
     assert np.abs(found[0, :2]).max() < 0.051
-    volume, _ = read_volume(folder / "v.tif")
+    volume, _ = gs.read_volume(folder / "v.tif")
     assert volume.sum() == pytest.approx(found[:, 3].sum(), rel=1e-5)
 
 
 @pytest.mark.integration
-def test_points_of_a_capture(folder, monkeypatch, capsys):
+def test_points_of_a_capture(folder, run):
     design = DESIGN.replace("[96, 80]", "[480, 400]").replace("_um = 20.0", "_um = 4.5")
     (folder / "design.toml").write_text(design)
     (folder / "points.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n")
-    run(monkeypatch, capsys, "simulate", "points.csv", "design.toml", "-o", "capture.tif")
+    run("simulate", "points.csv", "design.toml", "-o", "capture.tif")
     options = "--depths 19:21:0.25 --voxel-um 20 --suppress points -o v.tif --points p.csv".split()
-    status, out, err = run(monkeypatch, capsys, "reconstruct", "capture.tif", "design.toml", *options)
+    status, out, err = run("reconstruct", "capture.tif", "design.toml", *options)
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
-    found = read_points(folder / "p.csv")[0]
+    found = gs.read_points(folder / "p.csv")[0]
     # Four lenses within 0.45 mm: a pixel of parallax is 0.7 mm of depth, and a third of one is left.
     assert np.hypot(found[0] - 0.02, found[1] + 0.01) < 0.003 and abs(found[2] - 20) < 0.25
-    volume, grid = read_volume(folder / "v.tif")
+    volume, grid = gs.read_volume(folder / "v.tif")
     assert volume.sum() == pytest.approx(found[3], rel=1e-5)
 
 
 @pytest.mark.integration
-def test_a_surface_has_maps_beside_its_volume(folder, monkeypatch, capsys):
+def test_a_surface_has_maps_beside_its_volume(folder, run):
     tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
     options = "18:22:1 --voxel-um 50 --method surface --surface m.ome.tif -o v.tif -q".split()
-    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options)
+    status, out, _ = run(*RECONSTRUCT[:4], *options)
     assert status == 0 and "m.ome.tif: sheets leave" in out and ", one more " in out
     brightness, depth, _ = tifffile.imread(folder / "m.ome.tif")
-    volume, _ = read_volume(folder / "v.tif")
+    volume, _ = gs.read_volume(folder / "v.tif")
     np.testing.assert_allclose(volume.sum(0), brightness, rtol=1e-3, atol=1e-6 * brightness.max())
     assert (np.nan_to_num(depth, nan=2e4) >= 18_000).all() and (np.nan_to_num(depth, nan=2e4) <= 22_000).all()
 
 
 @pytest.mark.integration
-def test_a_score_is_told_and_kept(folder, monkeypatch, capsys):
+def test_a_score_is_told_and_kept(folder, run):
     """In the file's provenance, from which a report reads it."""
     image = np.random.default_rng(0).integers(7, 90, (96, 80)).astype(np.uint16)
     tifffile.imwrite(folder / "capture.tif", image)
     options = "20 --voxel-um 50 --score -o v.tif -q".split()
-    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options)
+    status, out, _ = run(*RECONSTRUCT[:4], *options)
     assert status == 0 and "v.tif: it predicts lenses that were left out" in out
     assert read_provenance(folder / "v.tif")[SCORE] in out
 
 
-def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):
+def test_one_depth_and_the_default_voxel(folder, run):
     """The default voxel is a pixel as seen at the middle depth."""
-    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], "20", "-o", "v.tif")
+    status, out, _ = run(*RECONSTRUCT[:4], "20", "-o", "v.tif")
     assert status == 0 and f"{20 * (20 + 1 / 1.43) / 5.8:.1f} um" in out and "at 20 mm" in out
 
 
@@ -140,61 +97,40 @@ def test_depths_include_the_stop_only_when_it_falls_on_the_step(text, count):
     assert len(parse_depths(text)) == count
 
 
-POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"
-
-
 @pytest.mark.integration
-def test_simulate_points(folder, monkeypatch, capsys):
-    (folder / "points.csv").write_text(POINTS)
+def test_simulate_points(folder, run):
+    (folder / "points.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n")
     command = ("simulate", "points.csv", "design.toml", "-o", "c.tif")
-    status, out, err = run(monkeypatch, capsys, *command)
+    status, out, err = run(*command)
     assert (status, err) == (0, "") and out.startswith("c.tif: 96 x 80 pixels, uint16, from 1")
-    first = read_capture(folder / "c.tif", (96, 80))
+    first = gs.read_capture(folder / "c.tif", (96, 80))
     assert abs(int(first.max()) - 1016) < 150  # 10,000 electrons, 10 a count, an offset of 16
-    run(monkeypatch, capsys, *command)
-    np.testing.assert_array_equal(read_capture(folder / "c.tif"), first)
-    run(monkeypatch, capsys, *command, "--seed", "1")
-    assert (read_capture(folder / "c.tif") != first).any()
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("x,y,z\n1,2,3\n", "got 'x,y,z'"),
-        ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm must be above 0, got -20.0"),
-        ("x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
-        (None, "gs-jax: voxels must not be negative, got -1 (scene.ome.tif).\n"),
-    ],
-)
-def test_wrong_scenes_give_one_line_and_status_2(folder, monkeypatch, capsys, content, words):
-    write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
-    (folder / "points.csv").write_text(content or "")
-    scene = "points.csv" if content else "scene.ome.tif"
-    status, out, err = run(monkeypatch, capsys, "simulate", scene, "design.toml", "-o", "c.tif")
-    assert (status, out) == (2, "") and not (folder / "c.tif").exists()
-    assert re.fullmatch(r"gs-jax: [^\n]*\n", err) and scene in err and words in err
+    run(*command)
+    np.testing.assert_array_equal(gs.read_capture(folder / "c.tif"), first)
+    run(*command, "--seed", "1")
+    assert (gs.read_capture(folder / "c.tif") != first).any()
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("optics", [(), ("--optics", "near", "--psf", "gaussian")], ids=["full", "near"])
-def test_simulate_a_volume_and_reconstruct_it(optics, folder, monkeypatch, capsys):
-    grid = Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
+def test_simulate_a_volume_and_reconstruct_it(optics, folder, run):
+    grid = gs.Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
     voxels = np.zeros((3, 9, 9), np.float32)
     voxels[1, 6, 3] = 1
-    write_volume(folder / "scene.zarr", voxels, grid)
+    gs.write_volume(folder / "scene.zarr", voxels, grid)
     simulate = ("simulate", "scene.zarr", "design.toml", *optics, "--no-noise", "-o", "capture.tif")
-    status, out, _ = run(monkeypatch, capsys, *simulate)
+    status, out, _ = run(*simulate)
     assert status == 0 and "float32, from " in out
     options = ("--depths", "20:20:1", "--voxel-um", "50", "-o", "v.tif")
-    run(monkeypatch, capsys, "reconstruct", "capture.tif", "design.toml", *options)
-    volume, found = read_volume(folder / "v.tif")
+    run("reconstruct", "capture.tif", "design.toml", *options)
+    volume, found = gs.read_volume(folder / "v.tif")
     _, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
     assert abs(float(found.y[row]) - 0.1) < 0.06 and abs(float(found.x[column]) + 0.05) < 0.06  # a voxel
 
 
-def test_layout(folder, monkeypatch, capsys):
+def test_layout(folder, run):
     arguments = ("layout", "--count", 200, "--size-mm", 20, 20, "--pitch-mm", 1.23, "--seed", 3, "-o", "c.csv")
-    status, out, _ = run(monkeypatch, capsys, *arguments)
+    status, out, _ = run(*arguments)
     assert status == 0
     pitch, spread = map(float, re.search(r"pitch ([\d.]+) mm, SD ([\d.]+) mm, 100.0 %", out).groups())  # pyright: ignore[reportOptionalMemberAccess]
     assert abs(pitch - 1.23) <= 0.02 and abs(spread - 0.09) <= 0.02
@@ -203,8 +139,8 @@ def test_layout(folder, monkeypatch, capsys):
     assert np.abs(np.loadtxt(lines[1:], delimiter=",")).max() <= 10
 
 
-def test_info(monkeypatch, capsys):
-    status, out, _ = run(monkeypatch, capsys, "info")
+def test_info(run):
+    status, out, _ = run("info")
     assert status == 0
     for name in ("gs-jax", "python", "jax", "devices", "memory"):
         assert re.search(rf"^{name} +\S", out, re.MULTILINE)
@@ -309,8 +245,8 @@ WRONG_ARGUMENTS = [
 
 
 @pytest.mark.parametrize(("arguments", "words"), WRONG_ARGUMENTS)
-def test_wrong_arguments_give_one_line_and_status_2(folder, monkeypatch, capsys, arguments, words):
-    status, out, err = run(monkeypatch, capsys, *shlex.split(arguments))
+def test_wrong_arguments_give_one_line_and_status_2(folder, run, arguments, words):
+    status, out, err = run(*shlex.split(arguments))
     assert (status, out) == (2, "") and len(err) < 400
     assert re.fullmatch(r"gs-jax: [^\n]+\n", err)
     assert all(part in err for part in words.split(".*")), err
@@ -324,16 +260,28 @@ def test_wrong_arguments_give_one_line_and_status_2(folder, monkeypatch, capsys,
         ("design.toml", DESIGN.replace("[96, 80]", "[96, 81]"), "capture.tif"),
         ("capture.tif", "not an image", "capture.tif"),
         ("capture.tif", "", "capture.tif"),
+        ("points.csv", "x,y,z\n1,2,3\n", "got 'x,y,z'"),
+        (
+            "points.csv",
+            "x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n",
+            "point 1, z_mm must be above 0, got -20.0",
+        ),
+        ("points.csv", "x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
+        ("scene.ome.tif", None, "gs-jax: voxels must not be negative, got -1 (scene.ome.tif).\n"),
     ],
 )
-def test_wrong_files_give_one_line_and_status_2(folder, monkeypatch, capsys, name, content, words):
-    (folder / name).write_text(content)
-    status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
-    assert (status, out) == (2, "") and not (folder / "v.tif").exists()
-    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err
+def test_wrong_files_give_one_line_and_status_2(folder, run, name, content, words):
+    gs.write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), gs.Grid([20.0], (3, 3), 0.05))
+    if content is not None:
+        (folder / name).write_text(content)
+    simulates = name in ("points.csv", "scene.ome.tif")
+    command = ("simulate", name, "design.toml") if simulates else RECONSTRUCT
+    status, out, err = run(*command, "-o", "made.tif")
+    assert (status, out) == (2, "") and not (folder / "made.tif").exists()
+    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err and (name in err or not simulates)
 
 
-def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
+def test_an_internal_fault_is_not_swallowed(folder, monkeypatch):
     def fault(*_, **__):
         raise ValueError("not the user's")
 
@@ -343,12 +291,12 @@ def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
         main()
 
 
-def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
+def test_interrupt_leaves_nothing_half_written(folder, run, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gs_jax.reconstruction.plan.Reconstructor", interrupt)
-    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    status, _, err = run(*RECONSTRUCT, "-o", "v.tif")
     assert (status, err.strip()) == (130, "gs-jax: interrupted")
     assert not (folder / "v.tif").exists()
 
@@ -366,12 +314,12 @@ def test_as_a_process(folder):
 
 
 @pytest.mark.integration
-def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys):
+def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, run):
     """The first milestone: the point within 20 um laterally and 100 um axially, in a file to scale."""
     capture, design = needs("oracle/dev/P1_a.tif"), needs("oracle/dev/P1.toml")
     output = tmp_path / "v.ome.tif"
     arguments = ("--depths", "19.5:20.5:0.05", "--voxel-um", "20", "-o", output)
-    status, _, err = run(monkeypatch, capsys, "reconstruct", capture, design, *arguments)
+    status, _, err = run("reconstruct", capture, design, *arguments)
     # On a busy machine it says how far it is.
     assert status == 0 and all(line.startswith("gs-jax: ") for line in err.splitlines())
     with tifffile.TiffFile(output) as file:
@@ -379,24 +327,24 @@ def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys
         pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]  # pyright: ignore[reportArgumentType]
     assert pixels["PhysicalSizeX"] == pytest.approx(20) and pixels["PhysicalSizeXUnit"] in ("µm", "\u03bcm")
     assert pixels["PhysicalSizeZ"] == pytest.approx(50)
-    volume, grid = read_volume(output)
+    volume, grid = gs.read_volume(output)
     z, y, x = np.unravel_index(int(volume.argmax()), volume.shape)
     assert abs(float(grid.depths[z]) - 20) <= 0.1
     assert np.hypot(float(grid.x[x]), float(grid.y[y])) <= 0.02
 
 
 @pytest.mark.slow
-def test_demo(tmp_path, monkeypatch, capsys):
-    status, out, err = run(monkeypatch, capsys, "demo", "--out", tmp_path / "demo")
+def test_demo(tmp_path, run):
+    status, out, err = run("demo", "--out", tmp_path / "demo")
     assert (status, err) == (0, "") and "report.md" in out and "report.html" in out
     made = {p.name for p in (tmp_path / "demo").iterdir()}
     assert made >= {"design.toml", "optimized.toml", "words.tif", "words.ome.tif", "points-found.csv", "mold.stl"}
     page = (tmp_path / "demo" / "report.html").read_text()
     assert 1e6 < len(page) < 15e6 and str(tmp_path) not in page
-    assert len(read_points(tmp_path / "demo" / "points-found.csv")) == pytest.approx(60, abs=2)
+    assert len(gs.read_points(tmp_path / "demo" / "points-found.csv")) == pytest.approx(60, abs=2)
     report = (tmp_path / "demo" / "report.md").read_text()
     assert all(name in made for name in re.findall(r"!\[.*\]\((.*)\)", report)) and "NO" not in report
-    volume, grid = read_volume(tmp_path / "demo" / "words.ome.tif")
+    volume, grid = gs.read_volume(tmp_path / "demo" / "words.ome.tif")
     # Each word is brightest on its own plane: at 18, 20 and 22 mm.
     for depth, (x, y) in ((18, (-4, -5)), (20, (0, 0)), (22, (4, 5))):
         near = np.ix_(abs(np.asarray(grid.y) - y) < 1.5, abs(np.asarray(grid.x) - x) < 4)

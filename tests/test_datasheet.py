@@ -21,7 +21,6 @@ from gs_jax.optics.aberrations import linear_rms
 from gs_jax.optics.apertures import clear_diameter, pitch
 
 from .helpers import scene
-from .test_cli import run
 from .test_designs import written
 
 LISTS = (
@@ -174,22 +173,9 @@ def test_an_infinite_plate_has_no_density():
 
 
 BY_DEPTH = (
-    "lenses_per_point",
-    "occupancy",
-    "coverage",
-    "depth_of_field",
-    "approximate_depth_of_field",
-    "near_limit",
-    "far_limit",
-    "focus_distance",
-    "sensor_blur",
-    "blur",
-    "lateral_resolution",
-    "axial_resolution",
-    "light",
-    "field_of_view",
-    "log_strehl",
-)
+    "lenses_per_point occupancy coverage depth_of_field approximate_depth_of_field near_limit far_limit focus_distance "
+    "sensor_blur blur lateral_resolution axial_resolution light field_of_view log_strehl"
+).split()
 
 
 @pytest.mark.integration
@@ -256,12 +242,12 @@ def test_the_built_in_design_matches_its_file():
 
 
 @pytest.mark.integration
-def test_the_command(tmp_path, monkeypatch, capsys, table1):
+def test_the_command(tmp_path, run, table1):
     output = tmp_path / "sheet.json"
     options = ("--depths", "20:22:1", "--confusion-um", "18", "--json", output)
-    status, out, err = run(monkeypatch, capsys, "metrics", TABLE1, *options)
+    status, out, err = run("metrics", TABLE1, *options)
     assert (status, err) == (0, "") and out.count("\n") == 5 and "FWHM" in out and out.endswith("--verbose\n")
-    status, out, _ = run(monkeypatch, capsys, "metrics", TABLE1, *options, "--verbose")
+    status, out, _ = run("metrics", TABLE1, *options, "--verbose")
     assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], circle_of_confusion=0.018)
     assert "- At 20 mm the image forms 2 mm behind the sensor" in out and "the circle of confusion, 18 um" in out
 

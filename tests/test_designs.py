@@ -18,14 +18,17 @@ from pydantic import ValidationError
 
 from gs_jax import geomscope
 from gs_jax.base.errors import InputError, InputWarning
+from gs_jax.cli.options import ask_for_unit, shipped_designs
 from gs_jax.codesign.search import problem_of
 from gs_jax.codesign.study import read_study
 from gs_jax.design.design import Design, read_design, write_design
 from gs_jax.design.start import commented, design_keys
+from gs_jax.design.validation import USUAL, slip
+from gs_jax.microscope.layouts import coverage, nearest_neighbour_distances
 from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.optics.raytrace import to_numpy
 
-from .helpers import examples, needs, quantities
+from .helpers import DESIGN, examples, needs, quantities
 
 ROOT = Path(__file__).parents[1]
 DESIGNS = sorted(p for folder in ("design", "experiments/designs") for p in (ROOT / folder).glob("*.toml"))
@@ -484,3 +487,267 @@ def test_searches_keep_which_lens_is_of_which_kind(tmp_path):
     design = read_design(written(tmp_path, LISTS))
     study = read_study("experiments/designs/studies/geomscope-targets.toml")
     assert lenses_by_type(problem_of(design, study).imager.array) == ((0, 2), (1,))
+
+
+@pytest.mark.parametrize(
+    ("folder", "name", "distance"), [("design", "geomscope", 5.8), ("experiments/designs", "geomscope-table1", 4.0)]
+)
+def test_designs_are_what_their_script_makes(folder, name, distance):
+    shipped = read_design(ROOT / folder / f"{name}.toml")
+    made = geomscope(sensor_distance_mm=distance)
+    # The layout's search sums floats, so another processor may round its way to another layout: not the centres.
+    same = lambda design: design.model_dump(exclude={"name", "provenance", "array"})
+    assert shipped.name == name
+    assert same(shipped) == same(made)
+
+
+def test_the_layout_has_the_papers_statistics():
+    design = read_design(ROOT / "design" / "geomscope.toml")
+    centers = np.array(design.array.centers_mm)
+    distances = nearest_neighbour_distances(centers)
+    assert len(centers) == 200
+    assert abs(distances.mean() - 1.23) <= 0.02 and abs(distances.std() - 0.09) <= 0.02
+    assert coverage(centers, design.array.size_mm, diameter=2.0) == pytest.approx(1, abs=1e-4)
+
+
+# Lens centres as vendors, programs and people write them.
+
+
+# Of three lenses, mm.
+CENTERS_CENTERS = ((-1.0, -0.5), (0.5, 1.25), (1.0, -1.0))
+FORMS = {
+    "ours": "x_mm,y_mm\n-1,-0.5\n0.5,1.25\n1,-1\n",
+    "no header": "-1,-0.5\n0.5,1.25\n1,-1\n",
+    "spaced": " x_mm , y_mm \n -1, -0.5\n0.5 ,1.25 \n\n  1 , -1  \n",
+    "semicolons": "x_mm;y_mm\n-1;-0.5\n0.5;1.25\n1;-1\n",
+    "decimal commas": "x;y\n-1,0;-0,5\n0,5;1,25\n1;-1\n",
+    "tabs": "x\ty\n-1\t-0.5\n0.5\t1.25\n1\t-1\n",
+    "blanks": "x (mm)  y (mm)\n-1.0   -0.5\n 0.5    1.25\n 1.0   -1.0\n",
+    "blanks alone": "-1 -0.5\r\n0.5 1.25\r\n1 -1\r\n",
+    "numpy's": "# X [mm] Y [mm]\n-1.000e+00 -5.000e-01\n5.0e-01 1.25e+00\n1 -1\n",
+    "remarks": "# array 12 of July\n\nx,y\n# first\n-1,-0.5\n0.5,1.25\n1,-1\n",
+    "micrometres": "x_um,y_um\n-1000,-500\n500,1250\n1000,-1000\n",
+    "a vendor's": '"Lens #","Pos X (µm)","Pos Y (µm)","Sag"\n1,-1000,-500,ok\n2,500,1250,ok\n3,1000,-1000,bad\n',
+    "another letter": "no;X [μm];Y [μm]\nA;-1000;-500\nB;500;1250\nC;1000;-1000\n",
+    "in words": "center x micron,center y micron\n-1000,-500\n500,1250\n1000,-1000\n",
+    "y first": "Y,X\n-0.5,-1\n1.25,0.5\n-1,1\n",
+    "Fiji's": " ,Area,X,Y,XM\n1,7,-1,-0.5,0\n2,7,0.5,1.25,0\n3,7,1,-1,0\n",
+}
+
+
+def with_file(folder, text, **keys):
+    (folder / "c.csv").write_text(text, encoding="utf-8", newline="")
+    changes = {"array.centers_mm": MISSING, "array.centers_file": "c.csv"}
+    return written(folder, changes | {f"array.{key}": value for key, value in keys.items()})
+
+
+@pytest.mark.parametrize("text", FORMS.values(), ids=FORMS)
+def test_forms(tmp_path, text):
+    assert read_design(with_file(tmp_path, text)).array.centers_mm == CENTERS_CENTERS
+
+
+def test_a_spreadsheets_micrometres(tmp_path):
+    """Of Windows: one byte for the Greek letter, a line end of its own, decimal commas."""
+    path = with_file(tmp_path, "")
+    text = "Nr.;X [µm];Y [µm]\r\n1;-1000,0;-500,0\r\n2;500,0;1250,0\r\n3;1000,0;-1000,0\r\n"
+    (tmp_path / "c.csv").write_bytes(text.encode("cp1252"))
+    assert read_design(path).array.centers_mm == CENTERS_CENTERS
+
+
+def test_columns_by_name_and_unit_by_key(tmp_path):
+    text = "a,b,c\n9,-500,-1000\n9,1250,500\n9,-1000,1000\n"
+    path = with_file(tmp_path, text, centers_columns=["c", "b"], centers_unit="um")
+    assert read_design(path).array.centers_mm == CENTERS_CENTERS
+    blanks = "n  X (um)  Y (um)  Z (um)\n9 0 -1000 -500\n9 0 500 1250\n9 0 1000 -1000\n"
+    path = with_file(tmp_path, blanks, centers_columns=["Y (um)", "Z (um)"])
+    assert read_design(path).array.centers_mm == CENTERS_CENTERS
+    message_of(with_file(tmp_path, text, centers_columns=["c", "d"]), "column 'd'", "'a', 'b', 'c'")
+    message_of(with_file(tmp_path, "1,2\n", centers_columns=["c", "d"]), "no header", "'c' and 'd'")
+
+
+@pytest.mark.parametrize(
+    ("header", "factors"),
+    [
+        ("x_cm,y_cm", (10, 10)),
+        ("x_m,y_m", (1000, 1000)),
+        ("x_inch,y_inch", (25.4, 25.4)),
+        ("X [in],Y [in]", (25.4, 25.4)),
+        ('X ("),Y (")', (25.4, 25.4)),
+        ("x_nm,y_nm", (1e-6, 1e-6)),
+        ("x (mil),y (mil)", (0.0254, 0.0254)),
+        ("x (foot),y (foot)", (304.8, 304.8)),
+        ("center x in micrometers,center y in micrometers", (1e-3, 1e-3)),
+        # One alone is that of both, two are each its own.
+        ("x_cm,y", (10, 10)),
+        ("x_mm,y_um", (1, 1e-3)),
+        ("x_pos,y_pos", (1, 1)),
+        ("x_m,y_m,radius_of_curvature_mm", (1000, 1000)),
+    ],
+)
+def test_units_of_headers(tmp_path, header, factors):
+    rows = "\n".join(",".join(map(repr, [*(np.array(row) / factors).tolist(), 2.0])) for row in CENTERS_CENTERS)
+    rows = rows if header.count(",") == 2 else rows.replace(",2.0", "")
+    changes = {"lens.radius_of_curvature_mm": MISSING, "array.centers_mm": MISSING, "array.centers_file": "c.csv"}
+    (tmp_path / "c.csv").write_text(f"{header}\n{rows}\n", encoding="utf-8")
+    changes = changes if header.count(",") == 2 else {**changes, "lens.radius_of_curvature_mm": 2.0}
+    np.testing.assert_allclose(read_design(written(tmp_path, changes)).array.centers_mm, CENTERS_CENTERS, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("x_furlong,y_furlong", ["c.csv", "column 'x_furlong'", "nm, um, mm, cm", "got 'furlong'"]),
+        ("x (deg),y (deg)", ["column 'x (deg)'", "got 'deg'"]),
+        ("x_px,y_mm", ["both columns must be in pixels, or none", "x_px,y_mm"]),
+        ("x_mm,y_mm,radius_of_curvature_um", ["column 'radius_of_curvature_um' must be radius_of_curvature_mm"]),
+    ],
+)
+def test_other_units_are_refused_by_name(tmp_path, header, words):
+    rows = "".join(f"{x},{y}{',2' * (header.count(',') - 1)}\n" for x, y in CENTERS_CENTERS)
+    message_of(with_file(tmp_path, f"{header}\n{rows}"), *words)
+
+
+def test_pixels_are_those_of_a_capture(tmp_path):
+    """As the contract has it: x = (column - (columns - 1) / 2) pitch; the sensor has 400 rows of 300 pixels."""
+    middle, pitch = np.array([299, 399]) / 2, 0.0045
+    for first, origin in ((middle, {}), (0 * middle, {"centers_origin": "center"})):
+        rows = "".join(f"{x!r},{y!r}\n" for x, y in (np.array(CENTERS_CENTERS) / pitch + first).tolist())
+        path = with_file(tmp_path, f"x_px,y_px\n{rows}", **origin)
+        np.testing.assert_allclose(read_design(path).array.centers_mm, CENTERS_CENTERS, atol=1e-12)
+
+
+def test_from_a_corner(tmp_path):
+    """Of the plate, 3 x 4 mm."""
+    path = with_file(tmp_path, "x_um,y_um\n500,1500\n2000,3250\n2500,1000\n", centers_origin="corner")
+    np.testing.assert_allclose(read_design(path).array.centers_mm, CENTERS_CENTERS, atol=1e-12)
+
+
+def test_mirror_is_x_against_minus_x(tmp_path):
+    expected = tuple((-x, y) for x, y in CENTERS_CENTERS)
+    path = with_file(tmp_path, FORMS["ours"], mirror=True)
+    assert read_design(path).array.centers_mm == expected
+    assert read_design(written(tmp_path, {"array.mirror": True})).array.centers_mm == expected
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"centers_unit": "um"}, ["x_mm,y_mm", "unit must be", "got um"]),
+        ({"centers_units": "um"}, ["`array.centers_units`", "`centers_unit`"]),
+    ],
+)
+def test_wrong_keys(tmp_path, keys, words):
+    message_of(with_file(tmp_path, FORMS["ours"], **keys), *words)
+
+
+COLUMNS = "x_mm;y_mm;radius_of_curvature_mm;conic_constant\n-1;-0.5;2;0\n0,5;1,25;1,9;-0,5\n1;-1;2;0\n"
+
+
+def test_columns_of_each_lens(tmp_path):
+    lists = read_design(written(tmp_path, LISTS, "lists.toml"))
+    (tmp_path / "c.csv").write_text(COLUMNS)
+    keys = {"lens.radius_of_curvature_mm": MISSING, "array.centers_mm": MISSING, "array.centers_file": "c.csv"}
+    assert read_design(written(tmp_path, keys)) == lists
+    both = "only one of `lens.radius_of_curvature_mm`", "`array.centers_file`"
+    message_of(with_file(tmp_path, COLUMNS), *both)
+    message_of(with_file(tmp_path, COLUMNS.replace("1,9", "thick")), "line 3, radius_of_curvature_mm", "thick")
+    twice = COLUMNS.replace("conic_constant", "radius_of_curvature_mm")
+    message_of(with_file(tmp_path, twice), "'radius_of_curvature_mm' must be in the header once")
+
+
+# Slips of a unit get a question, and good designs get none.
+
+
+SLIPS = [
+    ("imaging.sensor_distance_mm", 5800.0, "imaging.sensor_distance_mm = 5800: did you mean 5.8 mm (5800 um)?"),
+    ("sensor.pixel_pitch_um", 4500.0, "did you mean 4.5 um (4500 nm)?"),
+    ("lens.radius_of_curvature_mm", 2000, "lens.radius_of_curvature_mm = 2000: did you mean 2 mm (2000 um)?"),
+    ("lens.radius_of_curvature_mm", [2000.0, 1900, 2000], "did you mean [1.9, 2] mm ([1900, 2000] um)?"),
+    ("lens.focal_length_mm", 4600.0, "did you mean 4.6 mm (4600 um)?"),
+    ("imaging.working_distance_mm", [0.018, 0.03], "= [0.018, 0.03]: did you mean [18, 30] mm ([0.018, 0.03] m)?"),
+    ("imaging.field_radius_mm", 3000.0, "did you mean 3 mm (3000 um)?"),
+    ("imaging.wavelength_nm", 52.0, "is it meant? Usual is 150 to 15000 nm."),
+    ("lens.refractive_index", 4.6, "lens.refractive_index = 4.6: is it meant? Usual is 1.3 to 4.1."),
+    ("sample", {"refractive_index": 2.4}, "sample.refractive_index = 2.4: is it meant? Usual is 1 to 2."),
+    (
+        "samples",
+        {"gel": {"refractive_index": 1.3, "layers": [{"thickness_mm": 170.0}]}},
+        "samples.gel.layers[0].thickness_mm = 170: did you mean 0.17 mm (170 um)?",
+    ),
+    # What is usual alone, and does not go together.
+    ("sample", {"refractive_index": 1.43, "surface_mm": 19.0}, "The object's medium begins at 19 mm."),
+    ("imaging.sensor_distance_mm", 58.0, "imaging.sensor_distance_mm = 58: is it meant? Lenses of f = 4.651 mm image"),
+    ("imaging.working_distance_mm", [3.0, 30.0], "Nearer than the focal length, 4.651 mm, no real image forms."),
+    ("array.substrate_thickness_mm", 0.05, "which alone are 0.268 mm high."),
+    ("imaging.field_radius_mm", 80.0, "imaging.field_radius_mm = 80: is it meant?"),
+    ("array.centers_mm", [[0.001, 0.0], [0.0, 0.0], [0.0, 0.002]], "are 0.00"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "question"), SLIPS, ids=[f"{key} {value}" for key, value, _ in SLIPS])
+def test_questions(tmp_path, key, value, question):
+    path = written(tmp_path, {key: value})
+    with pytest.warns(InputWarning) as said:
+        read_design(path)
+    text = str(said[0].message)
+    assert len(said) == 1 and question in text and len(text) - len(str(path)) < 200
+    assert text.startswith(f"{path}: {'imaging' if 'begins' in text else key}")
+
+
+REFUSED = [
+    ("imaging.wavelength_nm", 0.52, "imaging.wavelength_nm = 0.52: did you mean 520 nm (0.52 um)?"),
+    ("imaging.wavelength_nm", 520e-9, "did you mean 520 nm (5.2e-07 m)?"),
+    ("imaging.sensor_distance_mm", 0.0058, "did you mean 5.8 mm (0.0058 m)?"),
+    ("array.substrate_thickness_mm", 1000.0, "did you mean 1 mm (1000 um)?"),
+    ("sensor.pixel_pitch_um", 4.5e-6, "did you mean 4.5 um (4.5e-06 m)?"),
+    ("sensor.pixel_pitch_um", 0.0045, "did you mean 4.5 um (0.0045 mm)?"),  # lenses are beside so small a sensor
+    ("imaging.sensor_distance_mm", 58000, "did you mean 58 mm (58000 um)?"),
+    ("lens.aperture_diameter_mm", 2000.0, "did you mean 2 mm (2000 um)?"),  # larger than its sphere
+    ("lens.radius_of_curvature_mm", 0.002, "did you mean 2 mm (0.002 m)?"),
+    ("array.size_mm", [0.003, 0.004], "did you mean [3, 4] mm"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "question"), REFUSED, ids=[f"{key} {value}" for key, value, _ in REFUSED])
+def test_what_is_impossible_is_refused_with_the_question(tmp_path, key, value, question):
+    with pytest.raises(InputError) as caught:
+        read_design(written(tmp_path, {key: value}))
+    assert question in str(caught.value) and "must be" in str(caught.value)
+
+
+def test_good_designs_raise_none(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for path in shipped_designs():
+            read_design(path)
+        write_design(tmp_path / "a.toml", geomscope())
+        read_design(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("name", ["P1", "P2"])
+def test_the_authors_raise_none(name):
+    read_design(needs(f"oracle/dev/{name}.toml"))
+
+
+@pytest.mark.parametrize("value", [True, "5", None, [], [1.0, "a"], {}, 10**400, -5.0, 0.0, float("nan"), float("inf")])
+def test_of_what_is_no_number_nothing_is_said(value):
+    assert all(slip(key, value) is None for key in USUAL)
+
+
+@pytest.mark.integration
+def test_commands_say_it_once_and_go_on(folder, run):
+    """Whatever reads the design; a warning of another kind stays what it is."""
+    (folder / "design.toml").write_text(DESIGN.replace("sensor_distance_mm = 5.8", "sensor_distance_mm = 58.0"))
+    status, out, err = run("metrics", "design.toml")
+    assert status == 0 and "small" in out and "Warning" not in err
+    assert err.splitlines() == [line for line in err.splitlines() if line.startswith("gs-jax: design.toml: imaging.")]
+    assert err.count("\n") == 1
+
+
+def test_points_in_another_unit_are_asked_for():
+    points = np.array([[0.1, 0.2, 18000.0, 1.0], [0.3, 0.2, 20000.0, 1.0]])
+    with pytest.warns(InputWarning, match=r"p.csv: z_mm = \[18000, 20000\]: did you mean \[18, 20\] mm"):
+        ask_for_unit("p.csv", points)
+    # A far source beside near ones, or alone, is meant.
+    for meant in (points[:1], points * [1, 1, 0.001, 1], np.array([[0, 0, 20.0], [0, 0, 1e4]])):
+        ask_for_unit("p.csv", meant)

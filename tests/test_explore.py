@@ -26,11 +26,9 @@ from gs_jax.design.design import Design
 from gs_jax.optics import psf
 from gs_jax.optics.psf import spot_image
 
-from .browser import browser, watched
-from .test_cli import DESIGN, run
+from .browser import watched
+from .helpers import DESIGN
 from .test_manners import HEARD
-
-__all__ = ["browser"]
 
 STUDY = Study.model_validate(
     {
@@ -43,14 +41,8 @@ STUDY = Study.model_validate(
         "stages": [{"solver": "bfgs"}],
     }
 )
-MOVES = {
-    "sensor_distance_mm": 6.1,
-    "radius_of_curvature_mm": 2.2,
-    "aperture_diameter_mm": 0.3,
-    "near_mm": 17.0,
-    "far_mm": 26.0,
-    "field_radius_mm": 0.4,
-}
+MOVES = {"sensor_distance_mm": 6.1, "radius_of_curvature_mm": 2.2, "aperture_diameter_mm": 0.3}
+MOVES |= {"near_mm": 17.0, "far_mm": 26.0, "field_radius_mm": 0.4}
 
 
 @pytest.fixture(scope="module")
@@ -289,11 +281,11 @@ def test_a_browser_moves_it(server, browser):
 
 
 @pytest.mark.integration
-def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys):
+def test_wrong_input_is_one_line(tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "design.toml").write_text(DESIGN)
     for arguments, message in ((("none.toml",), "none.toml"), (("design.toml", "-o", "x.html"), "must be .toml")):
-        status, out, err = run(monkeypatch, capsys, "explore", *arguments, "--no-browser")
+        status, out, err = run("explore", *arguments, "--no-browser")
         assert (status, out, err.count("\n")) == (2, "", 1) and message in err
 
 

@@ -14,8 +14,8 @@ from gs_jax.reconstruction.networks import read_unrolled, write_unrolled
 from gs_jax.reconstruction.radius_fit import RadiusFit, with_radii
 from gs_jax.solvers.unrolled import initialize_unrolled
 
-from .test_cli import DESIGN
-from .test_cross_validation import GRID, exposed, scope
+from .helpers import DESIGN
+from .test_reconstruction import GRID, exposed, scope
 
 
 @pytest.mark.integration

@@ -18,35 +18,14 @@ from .helpers import design_and_capture
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder with a small design and a capture of five points: returns the points."""
+@pytest.mark.integration
+def test_files_take_strings_and_paths(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    return design_and_capture(tmp_path)
-
-
-@pytest.mark.integration
-def test_the_first_script(folder):
-    scope = gs.read_design("design/geomscope.toml").imager()
-    image = gs.read_capture("capture.tif", scope.sensor.shape)
-    grid = gs.Grid.over(scope.sensor, depths=np.arange(18, 22.1, 0.25), pitch=0.04)
-    volume = gs.reconstruct(image, scope, grid)
-    clean, points = gs.suppress(volume), gs.find_points(image, scope, grid)
-    figure = gs.show(clean, grid, points=points)
-
-    assert volume.shape == clean.shape == grid.volume_shape
-    assert gs.localization(points, folder).f1 == 1
-    figure.savefig("figure.png", dpi=40)
-    coarse = grid.at([18.5, 20.0, 21.5])
-    assert gs.reconstruct(image, scope, coarse, method=gs.RichardsonLucy(steps=2)).shape == coarse.volume_shape
-
-
-@pytest.mark.integration
-def test_files_take_strings_and_paths(folder, tmp_path):
+    points = design_and_capture(tmp_path)
     assert gs.read_design(tmp_path / "design" / "geomscope.toml") == gs.read_design("design/geomscope.toml")
     for path in ("points.csv", tmp_path / "points.csv"):
-        gs.write_points(path, folder)
-        np.testing.assert_array_equal(gs.read_points(path), folder)
+        gs.write_points(path, points)
+        np.testing.assert_array_equal(gs.read_points(path), points)
 
 
 def test_help_lists_every_name_with_its_first_line():

@@ -26,22 +26,9 @@ from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
 from .helpers import quantities
 
 DEPTHS, INDEX = np.array([20.0, 21.5, 23.0]), 1.43
-QUANTITIES = (
-    "axial_resolution",
-    "depth_of_field",
-    "approximate_depth_of_field",
-    "clear_diameter",
-    "near_limit",
-    "far_limit",
-    "focus_distance",
-    "focus_offset",
-    "lateral_resolution",
-    "lenses_per_point",
-    "light",
-    "occupancy",
-    "sensor_blur",
-    "spot_width",
-    "wavefront_error",
+QUANTITIES = tuple(
+    "axial_resolution depth_of_field approximate_depth_of_field clear_diameter near_limit far_limit focus_distance "
+    "focus_offset lateral_resolution lenses_per_point light occupancy sensor_blur spot_width wavefront_error".split()
 )
 
 

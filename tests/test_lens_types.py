@@ -7,25 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax import (
-    Imager,
-    MicrolensArray,
-    Sensor,
-    Unrolled,
-    find_points,
-    forward,
-    psf_model,
-    reconstruct,
-)
+import gs_jax as gs
 from gs_jax.detection.background import DetectionImage
 from gs_jax.detection.view_samples import LensType, detection_stats, sample_views, sample_views_by_type
 from gs_jax.microscope.lenses import lenses_by_type
 from gs_jax.optics.apertures import split_by_type
 from gs_jax.optics.psf_core import type_weights
-from gs_jax.projection.backprojection import backproject
-from gs_jax.reconstruction.pipeline import BackProjection, PinholeRichardsonLucy
-from gs_jax.simulation import random_points, simulate
-from gs_jax.solvers.richardson_lucy import RichardsonLucy
+from gs_jax.simulation import random_points
 
 from .test_full import grid, imager, volume
 from .test_point_finder import small
@@ -34,7 +22,7 @@ from .test_point_finder import small
 RADII = np.array([2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0])
 
 
-def differing(scope: Imager, radii=RADII, **numbers) -> Imager:
+def differing(scope: gs.Imager, radii=RADII, **numbers) -> gs.Imager:
     array = dataclasses.replace(scope.array, radius_of_curvature=jnp.asarray(radii, scope.sensor_distance.dtype))
     return eqx.tree_at(lambda i: i.array, scope, dataclasses.replace(array, **numbers))
 
@@ -44,11 +32,11 @@ def test_the_image_is_the_sum_of_the_kinds():
     """And of types with the same numbers nothing but what one type is, up to the cores of a mean lens."""
     scope, voxels = imager(), grid(shape=(7, 6))
     x = volume(voxels.volume_shape)
-    whole = forward(x, scope, voxels, psf_model(scope, voxels, "near"))
+    whole = gs.forward(x, scope, voxels, gs.psf_model(scope, voxels, "near"))
     # A number that changes nothing, but is another.
     almost = differing(scope, np.where(RADII > 2, 2.0 + 1e-9, 2.0))
     assert len(lenses_by_type(almost.array)) == 2
-    parts = forward(x, almost, voxels, psf_model(almost, voxels, "near"))
+    parts = gs.forward(x, almost, voxels, gs.psf_model(almost, voxels, "near"))
     # One PSF is of the mean clear area of all lenses, the other of each type's own.
     np.testing.assert_allclose(parts.sum(), whole.sum(), rtol=0.02)
     np.testing.assert_allclose(parts, whole, atol=0.05 * float(whole.max()))
@@ -66,17 +54,17 @@ def test_a_sharp_lens_counts_more():
 @pytest.mark.integration
 def test_back_projection_adds_kinds_by_weight():
     scope, voxels = differing(imager()), grid(shape=(7, 6))
-    image = np.asarray(simulate(np.array([[0.2, -0.1, 20.0, 1.0]]), scope))
-    assert reconstruct(image, scope, voxels).shape == voxels.volume_shape
-    flat = reconstruct(np.ones_like(image), scope, voxels, BackProjection(normalize=True))
+    image = np.asarray(gs.simulate(np.array([[0.2, -0.1, 20.0, 1.0]]), scope))
+    assert gs.reconstruct(image, scope, voxels).shape == voxels.volume_shape
+    flat = gs.reconstruct(np.ones_like(image), scope, voxels, gs.BackProjection(normalize=True))
     np.testing.assert_allclose(flat[flat > 0], 1, rtol=1e-5)
-    by_rays = reconstruct(image, scope, voxels, optics="pinhole")
-    np.testing.assert_array_equal(by_rays, np.asarray(backproject(image, imager(), voxels), np.float32))
-    found = reconstruct(image, scope, voxels, RichardsonLucy(steps=2), optics="near")
+    by_rays = gs.reconstruct(image, scope, voxels, optics="pinhole")
+    np.testing.assert_array_equal(by_rays, np.asarray(gs.backproject(image, imager(), voxels), np.float32))
+    found = gs.reconstruct(image, scope, voxels, gs.RichardsonLucy(steps=2), optics="near")
     assert np.isfinite(found).all() and found.max() > 0
     # On the pixels of each type's own cores, as back-projection.
-    for method in (PinholeRichardsonLucy(steps=2), Unrolled.pretrained()):
-        found = reconstruct(image, scope, voxels, method)
+    for method in (gs.PinholeRichardsonLucy(steps=2), gs.Unrolled.pretrained()):
+        found = gs.reconstruct(image, scope, voxels, method)
         assert np.isfinite(found).all() and found.max() > 0
 
 
@@ -87,8 +75,8 @@ def test_points_of_lenses_with_several_apertures():
     array = dataclasses.replace(scope.array, aperture_diameter=jnp.where(jnp.arange(49) % 3 == 0, 1.1, 0.9))
     scope = eqx.tree_at(lambda i: i.array, scope, array)
     points = random_points(8, (4.0, 4.0), (19.2, 20.8), seed=2)
-    image = simulate(points, scope, optics="near", psf="geometric")
-    found = find_points(image, scope, voxels)
+    image = gs.simulate(points, scope, optics="near", psf="geometric")
+    found = gs.find_points(image, scope, voxels)
     apart = found[:, None, :3] - points[:, :3]
     # Half a pixel in the object laterally. 0.1 mm axially moves no spot by more than a third of a pixel.
     near = (np.hypot(apart[..., 0], apart[..., 1]) < 0.016) & (np.abs(apart[..., 2]) < 0.1)
@@ -119,9 +107,9 @@ def test_the_image_is_that_of_rays():
     from experiments.ray_tracer import traced
 
     place = (np.argwhere(np.ones((5, 5))) - 2) * 1.3 + np.random.default_rng(0).uniform(-0.2, 0.2, (25, 2))
-    array = MicrolensArray(place, radius_of_curvature=np.array([2.0, 2.15])[np.arange(25) % 2])
-    scope = Imager(array, Sensor((640, 640), 0.0135), 5.8, 3.0)
+    array = gs.MicrolensArray(place, radius_of_curvature=np.array([2.0, 2.15])[np.arange(25) % 2])
+    scope = gs.Imager(array, gs.Sensor((640, 640), 0.0135), 5.8, 3.0)
     points = np.array([[0.3, -0.4, 20.0, 1.0], [-1.2, 1.1, 24.0, 1.0], [1.4, 0.9, 17.0, 1.0]])
-    image, true = simulate(points, scope), traced(points, scope, 400_000)
+    image, true = gs.simulate(points, scope), traced(points, scope, 400_000)
     assert np.linalg.norm(image - true) < 0.25 * np.linalg.norm(true)
     np.testing.assert_allclose(image.sum(), true.sum(), rtol=0.01)

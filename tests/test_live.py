@@ -19,10 +19,7 @@ from gs_jax.io.ngff import JOURNAL, VolumeSeries, check_replaceable, read_series
 from gs_jax.io.recordings import WatchedFolder
 from gs_jax.reconstruction import recording as live
 
-from .test_cli import folder, run
 from .test_recording import FRAMES, OPTIONS, expected, level, volumes
-
-__all__ = ["folder"]
 
 pytest.importorskip("watchfiles", reason="no watchfiles: pip install 'gs-jax[live]'")
 
@@ -258,21 +255,21 @@ class Steps:
         return names
 
 
-def watch(monkeypatch, capsys, steps, *arguments):
+def watch(run, monkeypatch, steps, *arguments):
     monkeypatch.setattr(WatchedFolder, "changes", steps)
-    return run(monkeypatch, capsys, *WATCH, *arguments)
+    return run(*WATCH, *arguments)
 
 
-def test_the_command(folder, monkeypatch, capsys):
+def test_the_command(folder, run, monkeypatch):
     """Two runs, each ended by Ctrl-C: volumes are those of a recording."""
-    status, out, err = watch(monkeypatch, capsys, Steps(["f0.tif"], ["f1.tif", "f2.tif"]))
+    status, out, err = watch(run, monkeypatch, Steps(["f0.tif"], ["f1.tif", "f2.tif"]))
     assert status == 130 and "run: watched until Ctrl-C" in err
     assert err.splitlines()[-1] == "gs-jax: interrupted; v.zarr has what is done, and --resume goes on from it"
     assert "v.zarr: 2 frames of 3\n" in out and "v.zarr: 1 capture has no volume; --resume makes it\n" in out
     assert re.search(r"from a capture's last byte to its volume: \d\d s at the median, \d\d s in 95 %", out)
-    status, _, err = watch(monkeypatch, capsys, Steps())
+    status, _, err = watch(run, monkeypatch, Steps())
     assert status == 2 and "has 2 frames of a watched folder; give --resume" in err
-    status, out, err = watch(monkeypatch, capsys, Steps(["f3.tif", "f4.tif"], [], []), "--resume")
+    status, out, err = watch(run, monkeypatch, Steps(["f3.tif", "f4.tif"], [], []), "--resume")
     assert status == 130 and "gs-jax: frame 3 (f3.tif): " in err
     assert "v.zarr: 2 frames of 5; 2 were there" in out and "1 capture has no volume, 1 failed" in out
     made = volumes()
@@ -281,12 +278,12 @@ def test_the_command(folder, monkeypatch, capsys):
 
 
 @pytest.mark.integration
-def test_points_are_written_with_the_volumes(folder, monkeypatch, capsys):
-    status, _, _ = watch(monkeypatch, capsys, Steps(["f0.tif"], [], []), "--points", "p.csv")
+def test_points_are_written_with_the_volumes(folder, run, monkeypatch):
+    status, _, _ = watch(run, monkeypatch, Steps(["f0.tif"], [], []), "--points", "p.csv")
     assert status == 130 and (folder / "p.csv").read_text().startswith("x_mm,y_mm,z_mm,intensity,frame")
 
 
-def test_wrong_input_is_one_line(folder, monkeypatch, capsys):
+def test_wrong_input_is_one_line(folder, run, monkeypatch):
     os.mkdir("run")
     last = WATCH[:-1]
     for arguments, words in {
@@ -297,9 +294,9 @@ def test_wrong_input_is_one_line(folder, monkeypatch, capsys):
         (WATCH[0], "capture.tif", *WATCH[2:]): "capture.tif must be a folder to be watched, got a file",
         (WATCH[0], "none", *WATCH[2:]): "none must be a folder to be watched, got none",
     }.items():
-        status, out, err = run(monkeypatch, capsys, *arguments)
+        status, out, err = run(*arguments)
         assert (status, out) == (2, "") and words in err and err.count("\n") == 1
     monkeypatch.setitem(sys.modules, "watchfiles", None)
-    status, _, err = run(monkeypatch, capsys, *WATCH)
+    status, _, err = run(*WATCH)
     assert status == 2 and "pip install 'gs-jax[live]'" in err and err.count("\n") == 1
     assert not os.path.exists("v.zarr")

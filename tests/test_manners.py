@@ -15,17 +15,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+import gs_jax as gs
 from gs_jax.__main__ import COMMANDS, commands, interrupt_message
 from gs_jax.cli import options
 from gs_jax.cli.commands import RESUMABLE
 from gs_jax.cli.reconstruct import deconvolve_command
-from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
-from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
-from gs_jax.io.point_tables import write_points
-from gs_jax.io.volumes import write_volume
-from gs_jax.microscope.grid import Grid
 from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
 from gs_jax.mold.heights import HEIGHT_SUFFIXES, write_heights
 from gs_jax.optics.psf import PSFS
@@ -34,9 +30,8 @@ from gs_jax.reconstruction.deconvolution import SOLVERS
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.simulation import OPTICS
 
-from .test_cli import RECONSTRUCT, folder, run
+from .test_cli import RECONSTRUCT
 
-__all__ = ["folder"]
 ROOT = Path(__file__).parents[1]
 
 
@@ -68,8 +63,8 @@ def test_help_imports_nothing_heavy():
         assert all(param.help for param in command.params if isinstance(param, click.Option)), name
 
 
-def test_without_arguments_it_shows_its_help(monkeypatch, capsys):
-    status, out, _ = run(monkeypatch, capsys)
+def test_without_arguments_it_shows_its_help(run):
+    status, out, _ = run()
     assert status == 0 and out.startswith("Usage: gs-jax") and "reconstruct" in out
 
 
@@ -86,7 +81,7 @@ def test_reconstruct_by_default_needs_no_scipy(folder):
     assert done.returncode == 0, done.stderr
 
 
-def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):
+def test_an_output_that_is_an_input_is_refused(folder, run):
     os.link(folder / "capture.tif", folder / "linked.tif")
     (folder / "pointer.tif").symlink_to("capture.tif")
     for arguments in (
@@ -102,22 +97,22 @@ def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):
         for name in ("scene.ome.tif", "study.toml", "dark.tif"):
             (folder / name).touch()
         before = {path: path.read_bytes() for path in folder.iterdir()}
-        status, _, err = run(monkeypatch, capsys, *arguments)
+        status, _, err = run(*arguments)
         assert status == 2 and "the output must be another file than the inputs" in err, arguments
         assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_what_people_write_is_replaced_by_force_alone(folder, monkeypatch, capsys):
+def test_what_people_write_is_replaced_by_force_alone(folder, run):
     layout = ("layout", "--count", 200, "--size-mm", 20, 20, "--pitch-mm", 1.23, "-o", "c.csv")
     (folder / "c.csv").write_text("mine")
-    status, _, err = run(monkeypatch, capsys, *layout)
+    status, _, err = run(*layout)
     assert status == 2 and "c.csv: the output must be a new file" in err and "--force" in err
     assert (folder / "c.csv").read_text() == "mine"
-    status, _, err = run(monkeypatch, capsys, *layout, "--force")
+    status, _, err = run(*layout, "--force")
     assert status == 0 and "replaced c.csv" in err and "x_mm" in (folder / "c.csv").read_text()
     # Results need no force.
     (folder / "v.tif").write_text("old")
-    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    status, _, err = run(*RECONSTRUCT, "-o", "v.tif")
     assert status == 0 and err.strip() == "gs-jax: replaced v.tif"
 
 
@@ -135,7 +130,7 @@ def small_disk(tmp_path_factory):
 
 
 NOISE = np.random.default_rng(0).random((2, 99, 99), np.float32)
-GRID = Grid([18.0, 20.0], NOISE.shape[1:], 0.1)
+GRID = gs.Grid([18.0, 20.0], NOISE.shape[1:], 0.1)
 MESH = Mesh(NOISE.reshape(-1, 3)[:999], np.arange(999).reshape(-1, 3))
 CIRCLES = np.column_stack([np.arange(999), np.zeros(999), np.full(999, 0.5)])
 MASK = Mask(np.array([[-1.0, -1.0], [999.0, -1.0], [999.0, 1.0], [-1.0, 1.0]]), CIRCLES, [], [])
@@ -148,13 +143,13 @@ def _picture(path):
 
 
 WRITERS = {
-    "v.ome.tif": lambda path: write_volume(path, NOISE, GRID),
-    "v.zarr": lambda path: write_volume(path, NOISE, GRID),
-    "c.tif": lambda path: write_capture(path, NOISE[0]),
-    "c.png": lambda path: write_capture(path, NOISE[0].view(np.uint16)),
-    "c.npy": lambda path: write_capture(path, NOISE[0]),
-    "p.csv": lambda path: write_points(path, 1 + NOISE.reshape(-1, 6)[:, :4]),
-    "d.toml": lambda path: write_design(path, read_design(ROOT / "design" / "geomscope.toml")),
+    "v.ome.tif": lambda path: gs.write_volume(path, NOISE, GRID),
+    "v.zarr": lambda path: gs.write_volume(path, NOISE, GRID),
+    "c.tif": lambda path: gs.write_capture(path, NOISE[0]),
+    "c.png": lambda path: gs.write_capture(path, NOISE[0].view(np.uint16)),
+    "c.npy": lambda path: gs.write_capture(path, NOISE[0]),
+    "p.csv": lambda path: gs.write_points(path, 1 + NOISE.reshape(-1, 6)[:, :4]),
+    "d.toml": lambda path: gs.write_design(path, gs.read_design(ROOT / "design" / "geomscope.toml")),
     "w.npz": lambda path: write_weights(path, pretrained("paper")),
     "f.png": _picture,
     "r.html": lambda path: write_text(path, 9999 * "r", [".html"]),
@@ -171,27 +166,27 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_is_one_line_and_status_1(small_disk, monkeypatch, capsys, name):
+def test_a_full_disk_is_one_line_and_status_1(small_disk, run, monkeypatch, name):
     path = small_disk / name
     monkeypatch.setattr(commands, "main", lambda **_: WRITERS[name](path))
-    status, _, err = run(monkeypatch, capsys)
+    status, _, err = run()
     assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
     assert list(small_disk.iterdir()) == []
 
 
 @pytest.mark.integration
-def test_a_command_on_a_full_disk_leaves_nothing(small_disk, folder, monkeypatch, capsys):
+def test_a_command_on_a_full_disk_leaves_nothing(small_disk, folder, run):
     path = small_disk / "v.ome.tif"
-    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", path)
+    status, _, err = run(*RECONSTRUCT, "-o", path)
     assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
     assert list(small_disk.iterdir()) == []
 
 
-def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
+def test_resume_without_a_checkpoint_says_that(folder, run):
     (folder / "study.toml").touch()
     optimize = ("optimize", "design.toml", "--study", "study.toml", "-o", "new.toml")
     for arguments in (optimize, ("train", "-o", "w.npz")):
-        status, _, err = run(monkeypatch, capsys, *arguments, "--resume")
+        status, _, err = run(*arguments, "--resume")
         assert status == 2 and "--resume must be used after an interrupted run" in err and "study" not in err
 
 
@@ -317,14 +312,14 @@ def test_a_folder_that_threads_still_write_to_is_removed(tmp_path):
 
 
 @pytest.mark.integration
-def test_a_design_is_found_by_its_name(folder, monkeypatch, capsys):
+def test_a_design_is_found_by_its_name(folder, run, monkeypatch):
     monkeypatch.chdir(folder)
     assert {path.stem for path in options.shipped_designs()} >= {"geomscope", "geomscope-optimized", "endoscope"}
-    status, out, _ = run(monkeypatch, capsys, "metrics", "endoscope")
+    status, out, _ = run("metrics", "endoscope")
     assert status == 0 and out.startswith("endoscope: ")
-    status, _, err = run(monkeypatch, capsys, "metrics", "endoskop")
+    status, _, err = run("metrics", "endoskop")
     assert status == 2 and "endoskop: cannot be read" in err
-    status, out, _ = run(monkeypatch, capsys, "info", "--designs")
+    status, out, _ = run("info", "--designs")
     assert status == 0 and {line.split()[0] for line in out.splitlines()} == {p.stem for p in options.shipped_designs()}
 
 
@@ -335,13 +330,13 @@ def test_the_wheel_has_every_design():
 
 
 @pytest.mark.integration
-def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):
+def test_the_camera_of_simulate_is_free(folder, run, monkeypatch):
     options = "--optics near --bits 8 --gain 20 --offset 7 --read-noise 0 --full-well 900".split()
     (folder / "scene.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.1,0.1,20,1\n")
     monkeypatch.chdir(folder)
-    status, _, err = run(monkeypatch, capsys, "simulate", "scene.csv", "design.toml", *options, "-o", "c8.tif")
+    status, _, err = run("simulate", "scene.csv", "design.toml", *options, "-o", "c8.tif")
     assert status == 0, err
-    counts = read_capture(folder / "c8.tif")
+    counts = gs.read_capture(folder / "c8.tif")
     # 900 electrons of 20 a count, on an offset of 7.
     assert counts.dtype == np.uint8 and counts.min() == 7 and counts.max() == 52
 
@@ -355,10 +350,10 @@ def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):
         ("lxml", "mold", ("mold", "design.toml", "-o", "out.3mf")),
     ],
 )
-def test_a_missing_extra_is_named_and_nothing_is_written(module, extra, arguments, folder, monkeypatch, capsys):
+def test_a_missing_extra_is_named_and_nothing_is_written(module, extra, arguments, folder, run, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == module]:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, module, None)
-    status, _, err = run(monkeypatch, capsys, *arguments)
+    status, _, err = run(*arguments)
     assert status == 2 and err.endswith(f"gs-jax[{extra}]'.\n") and err.count("\n") == 1
     assert not list(Path().glob("out.*"))

@@ -1,26 +1,41 @@
 """The array and its mold as solids: what they are, not how they are triangulated."""
 
+import csv
 import dataclasses
+import json
 import math
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import equinox as eqx
 import jax
 import manifold3d as m3
 import numpy as np
 import pytest
+import tifffile
+import trimesh
+from click.testing import CliRunner
+from ezdxf.filemanagement import readfile
 from hypothesis import given, settings, strategies as st
+from PIL import Image
 from scipy.integrate import quad
+from scipy.interpolate import RegularGridInterpolator
 
-from gs_jax import MicrolensArray
+import gs_jax as gs
+from gs_jax import InputError, MicrolensArray
+from gs_jax.__main__ import commands
 from gs_jax.design.design import read_design
-from gs_jax.mold.export import float32_mesh, make_mask
+from gs_jax.io.provenance import read_provenance
+from gs_jax.mold.export import float32_mesh, make_mask, write_mask
+from gs_jax.mold.heights import HEIGHT_SUFFIXES, write_heights
 from gs_jax.mold.lenslets import DRAFT, Lenslet, Part, tessellate
 from gs_jax.mold.manufacturability import check_solid
 from gs_jax.mold.measurement import measure_lenslets
 from gs_jax.mold.solids import (
     ENGRAVING_DEPTH,
     MoldShape,
+    alignment_marks,
     array_solid,
     array_volume,
     cast_solid,
@@ -428,3 +443,261 @@ def test_a_label_that_cannot_be_drawn_is_left_out(part):
 def test_a_wrong_shape_is_refused(wrong):
     with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` must be"):
         MoldShape(**wrong)
+
+
+# The opaque mask between lenses, as other programs read it.
+
+
+DESIGNS = Path(__file__).parents[1] / "design"
+# One alone, two that overlap, one across the edge of the plate; of three sizes.
+ARRAY = MicrolensArray(
+    [[-2.0, 1.0], [1.0, 0.0], [1.6, 0.0], [0.0, -3.0]], 2.0, 1.43, [0.8, 1.4, 1, 1], 1.0, size=(6.0, 6.0)
+)
+# Of two discs of radii 0.7 and 0.5, 0.6 apart: both less the lens that they share, of two segments on a chord.
+CHORD_AT = (0.6**2 + 0.7**2 - 0.5**2) / (2 * 0.6)
+SEGMENTS = [r**2 * math.acos(h / r) - h * math.sqrt(r**2 - h**2) for r, h in ((0.7, CHORD_AT), (0.5, 0.6 - CHORD_AT))]
+PAIR = math.pi * (0.7**2 + 0.5**2) - sum(SEGMENTS)
+
+
+def area(ring) -> float:
+    x, y = np.asarray(ring).T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+
+
+def test_openings_are_the_lenses_on_the_plate():
+    mask = make_mask(ARRAY)
+    np.testing.assert_allclose(mask.circles, [[-2, 1, 0.8]])
+    assert sum(map(area, mask.openings)) == pytest.approx(PAIR + math.pi / 8, rel=1e-3)
+    assert max(np.abs(ring).max() for ring in mask.openings) <= 3
+    low, high = mold_bounds(Part(ARRAY), MoldShape())
+    np.testing.assert_allclose([mask.outline.min(0), mask.outline.max(0)], [low[:2], high[:2]])
+    assert sum(map(area, mask.marks)) == pytest.approx(
+        sum(plan.area() for plan in alignment_marks(Part(ARRAY), MoldShape()))
+    )
+    assert len(mask.marks) == 3
+
+
+def test_dxf(tmp_path):
+    write_mask(tmp_path / "a.dxf", make_mask(ARRAY))
+    document = readfile(tmp_path / "a.dxf")
+    assert document.units == 4 and not document.audit().errors  # mm
+    found = {layer: [e for e in document.modelspace() if e.dxf.layer == layer] for layer in ("OPENINGS", "MARKS")}
+    (circle,) = (e for e in found["OPENINGS"] if e.dxftype() == "CIRCLE")
+    assert tuple(circle.dxf.center)[:2] == (-2, 1) and circle.dxf.radius == 0.4
+    assert len(found["MARKS"]) == 3 and len(found["OPENINGS"]) == 3
+
+
+def test_svg(tmp_path):
+    write_mask(tmp_path / "a.svg", make_mask(ARRAY))
+    root = ElementTree.parse(tmp_path / "a.svg").getroot()
+    assert root.get("width") == f"{np.ptp(make_mask(ARRAY).outline[:, 0]):.10g}mm"
+    (circle,) = root.iterfind(".//{*}circle")
+    # The y axis of SVG points down, that of the drawing up.
+    assert (circle.get("cx"), circle.get("cy"), circle.get("r")) == ("-2", "1", "0.4")
+    (group,) = root
+    assert group.get("transform") == "matrix(1 0 0 -1 0 0)"
+
+
+def test_gds_has_polygons_without_holes(tmp_path):
+    gdstk = pytest.importorskip("gdstk")
+    ring = [(math.cos(a), math.sin(a)) for a in np.arange(6) * math.pi / 3]
+    mask = make_mask(MicrolensArray(np.array(ring), 2.0, 1.43, 1.4, 1.0, size=(6.0, 6.0)))
+    assert sorted(area(ring) > 0 for ring in mask.openings) == [False, True]
+    write_mask(tmp_path / "a.gds", mask)
+    library = gdstk.read_gds(tmp_path / "a.gds")
+    (cell,) = library.cells
+    found = sum(polygon.area() for polygon in cell.polygons if polygon.layer == 1)
+    assert library.unit == 1e-6 and found == pytest.approx(1e6 * sum(map(area, mask.openings)), rel=1e-4)
+
+
+def test_nothing_to_mask_is_said(tmp_path):
+    covered = MicrolensArray([[0.0, 0.0], [0.5, 0.0]], 3.0, 1.43, 3.0, 1.0, size=(1.0, 1.0))
+    with pytest.raises(InputError, match="lenses cover it"):
+        make_mask(covered)
+    result = CliRunner().invoke(commands, ["mask", str(DESIGNS / "geomscope.toml"), "-o", str(tmp_path / "a.svg")])
+    assert isinstance(result.exception, InputError) and "geomscope.toml" in str(result.exception)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_draws_and_signs(tmp_path):
+    path = tmp_path / "a.dxf"
+    result = CliRunner().invoke(commands, ["mask", str(DESIGNS / "geomscope-optimized.toml"), "-o", str(path)])
+    assert result.exit_code == 0 and "195 round openings and 5 others" in result.stdout
+    assert read_provenance(path)["command"].startswith("gs-jax mask ")
+
+
+# Files for makers and optical programs, as others read them: against the formula of the sag, and the mesh.
+
+
+HEIGHTS_CENTERS = ((-1.1, 0.7), (0.9, -0.4), (0.2, 1.4), (1.3, 1.1))
+SIZE = (4.0, 5.0)
+STEP = 0.05
+NM = 1e-6
+# Conics and terms of both signs, and lenses with walls.
+KINDS = {
+    "plano": {},
+    "curved": {"orientation": "curved"},
+    "unlike": {
+        "radius_of_curvature_mm": (2.0, 2.4, 2.0, 2.4),
+        "conic_constant": (0.0, -1.0, 0.5, 0.0),
+        "aperture_diameter_mm": (1.6, 1.4, 1.2, 1.6),
+    },
+    "curved asphere": {"orientation": "curved", "conic_constant": -0.6, "aspheric_terms": (2e-3, -1e-4)},
+}
+
+
+def design_of(kind: str) -> gs.Design:
+    design = gs.geomscope()
+    array = design.array.model_copy(update={"centers_mm": HEIGHTS_CENTERS, "size_mm": SIZE})
+    lens = design.lens.model_copy(update={"aperture_diameter_mm": 1.6} | KINDS[kind])
+    return design.model_copy(update={"array": array, "lens": lens})
+
+
+def height(design: gs.Design, x, y):
+    """Height above the plate at a point of the design, by the formula of ISO 10110-12; NaN on walls."""
+    lens: Any = design.lens
+    numbers = lens.radius_of_curvature_mm, lens.conic_constant, np.array(lens.aperture_diameter_mm) / 2
+    lenses = list(zip(*(np.broadcast_to(each, len(HEIGHTS_CENTERS)) for each in numbers), strict=True))
+
+    def sag(r, radius, conic):
+        c = 1 / radius
+        terms = sum(a * r**order for order, a in zip((4, 6), lens.aspheric_terms or (), strict=False))
+        return c * r**2 / (1 + np.sqrt(1 - (1 + conic) * c**2 * r**2)) + terms
+
+    top = max(sag(edge, *shape) for *shape, edge in lenses)
+    found, walls = (np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y))) for _ in range(2))
+    for (cx, cy), (*shape, edge) in zip(HEIGHTS_CENTERS, lenses, strict=True):
+        r, rim = np.hypot(x - cx, y - cy), top - sag(edge, *shape)
+        found = np.maximum(found, np.where(r <= edge, top - sag(np.minimum(r, edge), *shape), 0))
+        walls = np.maximum(walls, np.where((r > edge) & (r < edge + rim * math.tan(math.radians(5.1))), rim, 0))
+    return np.where(walls > found + NM, np.nan, found), top
+
+
+def axes(count, step=STEP):
+    return (np.arange(count) - (count - 1) / 2) * step
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+def test_maps_show_the_side_of_the_lenses(kind, tmp_path):
+    design = design_of(kind)
+    # From the sensor the design's y points down, from the object up.
+    down = design.lens.orientation == "plano"
+    y, x = np.meshgrid(axes(101) * (1 if down else -1), axes(81), indexing="ij")
+    expected, top = height(design, x, y)
+    compared = np.isfinite(expected)
+    assert np.mean(compared) > 0.9
+
+    write_heights(design, tmp_path / "a.tif", step=STEP)
+    with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+        page = tiff.pages.first
+        numerator, denominator = page.tags["XResolution"].value
+        assert numerator / denominator == pytest.approx(10 / STEP) and page.tags["ResolutionUnit"].value == 3
+        pixels = page.asarray()
+    assert pixels.dtype == np.float32
+    np.testing.assert_allclose(pixels[compared], expected[compared], atol=NM)
+
+    report = write_heights(design, tmp_path / "a.png", step=STEP)
+    with Image.open(tmp_path / "a.png") as image:
+        scale, pixels = json.loads(image.info["mm_per_count"]), np.asarray(image)
+    assert pixels.dtype == np.uint16 and scale == report["mm_per_count"] == pytest.approx(top / 65535)
+    np.testing.assert_allclose(pixels[compared] * scale, expected[compared], atol=scale / 2 + NM)
+
+    write_heights(design, tmp_path / "a.xyz", step=STEP)
+    right, up, out = np.loadtxt(tmp_path / "a.xyz").T
+    expected, _ = height(design, right, -up if down else up)
+    compared = np.isfinite(expected)
+    np.testing.assert_allclose(out[compared], expected[compared], atol=NM)
+
+
+def test_a_grid_sag_has_z_along_the_light(kind, tmp_path):
+    design = design_of(kind)
+    write_heights(design, tmp_path / "a.dat", step=STEP)
+    first, *_ = (tmp_path / "a.dat").read_text().split("\n")
+    assert first == "81 101 0.05 0.05 0 0 0"
+    z, dx, dy, dxdy, flag = np.loadtxt(tmp_path / "a.dat", skiprows=1).T.reshape(5, 101, 81)
+    assert not flag.any()
+    # OpticStudio begins at the least x and the largest y.
+    y, x = np.meshgrid(-axes(101), axes(81), indexing="ij")
+    toward = 1 if design.lens.orientation == "plano" else -1
+    along = lambda x, y: toward * (height(design, x, -y)[0] - height(design, x, -y)[1])
+    expected = along(x, y)
+    compared = np.isfinite(expected)
+    np.testing.assert_allclose(z[compared], expected[compared], atol=NM)
+    # Around the vertices, where differences do not cross an edge. The steps leave errors of 1e-6.
+    h = 1e-4
+    smooth = np.min([np.hypot(x - cx, -y - cy) for cx, cy in HEIGHTS_CENTERS], axis=0) < 0.4
+    assert smooth.sum() > 500
+    slopes = (along(x + h, y) - along(x - h, y)) / (2 * h), (along(x, y + h) - along(x, y - h)) / (2 * h)
+    corners = along(x + h, y + h) - along(x + h, y - h) - along(x - h, y + h) + along(x - h, y - h)
+    for found, value in ((dx, slopes[0]), (dy, slopes[1]), (dxdy, corners / (4 * h**2))):
+        np.testing.assert_allclose(found[smooth], value[smooth], atol=1e-5)
+
+
+def test_the_list_of_lenses_is_the_surface(kind, tmp_path):
+    design = design_of(kind)
+    write_heights(design, tmp_path / "a.csv")
+    with open(tmp_path / "a.csv", newline="") as file:
+        plate, *lenses = csv.DictReader(file)
+    assert plate["object_type"] == "Rectangular Volume" and len(lenses) == len(HEIGHTS_CENTERS)
+    assert [(float(lens["x_mm"]), -float(lens["y_mm"])) for lens in lenses] == list(HEIGHTS_CENTERS)
+    # Where the vertices and the plano face are, along the light.
+    front, thickness = float(plate["z_mm"]), float(plate["thickness_mm"])
+    t = design.array.substrate_thickness_mm
+    is_front = design.lens.orientation == "curved"
+    assert (front + thickness if is_front else front) == pytest.approx(t if is_front else -t, abs=NM)
+    for lens, radius in zip(
+        lenses, np.broadcast_to(design.lens.radius_of_curvature_mm, len(HEIGHTS_CENTERS)), strict=True
+    ):
+        vertex = float(lens["z_mm"]) + (0 if is_front else float(lens["thickness_mm"]))
+        assert vertex == pytest.approx(0, abs=NM)
+        assert float(lens["radius_1_mm" if is_front else "radius_2_mm"]) == (radius if is_front else -radius)
+        assert float(lens["radius_2_mm" if is_front else "radius_1_mm"]) == 0
+
+
+def test_the_map_is_that_of_the_mesh(tmp_path):
+    """Vertices of the array that is printed are in the map, whose rows run along the y of the part."""
+    for kind in ("plano", "curved"):
+        design = design_of(kind)
+        gs.make_mold(design, tmp_path / "a.stl", positive=True, chord=0.003)
+        report = write_heights(design, tmp_path / "a.tif", step=STEP)
+        x, y, z = np.asarray(trimesh.load_mesh(tmp_path / "a.stl").vertices, float).T
+        plate = report["plate_thickness_mm"] - report["vertex_height_mm"]
+        on_lenses = -z > plate + 0.01
+        heights = RegularGridInterpolator((axes(101), axes(81)), tifffile.imread(tmp_path / "a.tif"))
+        difference = heights(np.stack([y, x], axis=1)[on_lenses]) - (-z - plate)[on_lenses]
+        # Within the chord; in grooves, interpolation is worse.
+        assert on_lenses.sum() > 300 and np.mean(np.abs(difference) < 0.004) > 0.75
+
+
+def test_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    gs.write_design("d.toml", design_of("curved"))
+    run = lambda *arguments: CliRunner().invoke(commands, ["heights", "d.toml", *map(str, arguments)])
+    for suffix in HEIGHT_SUFFIXES:
+        done = run("-o", f"a{suffix}", *(() if suffix == ".csv" else ("--step-um", 50)))
+        assert done.exit_code == 0 and "read back" in done.output, done.output
+        assert "heights d.toml" in read_provenance(f"a{suffix}")["command"]
+        about = json.loads((tmp_path / f"a{suffix}.json").read_text())
+        assert about["lenses_face"] == "the object" and about["deviation_nm"] < (3 if suffix == ".png" else 0.5)
+    for arguments, words in {
+        ("-o", "a.step"): "suffix must be .tif, .png, .xyz, .dat, .csv, got '.step'",
+        ("-o", "b.xyz", "--step-um", "0.5"): "step of the grid must be at least .* got 0.5 um: 8001 x 10001 points",
+        ("-o", "a.csv"): "a.csv: the output must be a new file",
+    }.items():
+        with pytest.raises(gs.InputError, match=words):
+            CliRunner().invoke(
+                commands, ["heights", "d.toml", *arguments], catch_exceptions=False, standalone_mode=False
+            )
+    with pytest.raises(gs.InputError, match="step of the grid must be at most 1000 um, got 1001 um"):
+        write_heights("d.toml", "b.tif", step=1.001)
+    done = run("-o", "a.csv", "--force")
+    assert "gs-jax: replaced a.csv, a.csv.json" in done.stderr
+    design = design_of("plano")
+    ideal = design.model_copy(update={"lens": design.lens.model_copy(update={"focal_length_mm": 4.0})})
+    with pytest.raises(gs.InputError, match=r"`lens.focal_length_mm` must be R / \(n - 1\) = 4.651 mm, .* got 4"):
+        write_heights(ideal, "b.tif")
+    assert not list(tmp_path.glob("b.*"))

@@ -18,9 +18,7 @@ from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import read_volume, write_surface, write_volume
 from gs_jax.reconstruction import pipeline
 
-from .test_cli import DESIGN, folder, run
-
-__all__ = ["folder"]
+from .helpers import DESIGN
 
 MANIFEST = Path(__file__).parents[1] / "gs_jax" / "napari.yaml"
 # What napari and its libraries use of each other is theirs to renew.
@@ -128,14 +126,14 @@ def test_sheets_are_a_depth_map_and_a_surface_in_the_same_place(viewer, tmp_path
         assert len(surface.faces) == 2 * 4 * 3 and shown.data[2, 2] == 18500
 
 
-def test_a_file_becomes_what_the_command_writes(widget, viewer, folder, monkeypatch, capsys):
+def test_a_file_becomes_what_the_command_writes(widget, viewer, folder, run):
     widget.file.value = folder / "capture.tif"
     widget.run.clicked.emit(True)
     assert widget.cancel.enabled and not widget.run.enabled
     until(widget)
     assert errors() == []
     words = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:1", "--voxel-um", "50", "-o", "v.tif")
-    assert run(monkeypatch, capsys, *words)[0] == 0
+    assert run(*words)[0] == 0
     volume, grid = read_volume(folder / "v.tif")
     (layer,) = viewer.layers
     assert layer.name == "capture.tif, backproject" and not widget.cancel.enabled

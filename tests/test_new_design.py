@@ -18,10 +18,7 @@ from gs_jax.microscope.layouts import nearest_neighbour_distances
 from gs_jax.mold.manufacturability import check_design
 from gs_jax.mold.solids import MoldShape
 
-from .test_cli import folder, run
 from .test_designs import BASE, edited
-
-__all__ = ["folder"]
 
 NEEDED = {
     "--pixel-pitch-um": (3.45,),
@@ -48,9 +45,9 @@ def lab(folder):
     return folder
 
 
-def test_by_options(lab, monkeypatch, capsys):
+def test_by_options(lab, run):
     """A focal length in place of the radius; what is not said follows, and is named."""
-    status, out, err = run(monkeypatch, capsys, "new-design", *options(), "-o", "my.toml")
+    status, out, err = run("new-design", *options(), "-o", "my.toml")
     assert (status, err) == (0, "") and "4 lenses of f = 4.6 mm (R = 1.978 mm)" in out
     design = read_design("my.toml")
     assert design.array.centers_mm == CENTERS and design.name == "my"
@@ -64,7 +61,7 @@ def test_by_options(lab, monkeypatch, capsys):
     assert "input vendor.csv" in design.provenance and design.provenance["command"].startswith("gs-jax new-design")
 
 
-def test_everything_can_be_said(lab, monkeypatch, capsys):
+def test_everything_can_be_said(lab, run):
     everything = options(
         focal_length_mm=None,
         radius_of_curvature_mm=(2.1,),
@@ -77,7 +74,7 @@ def test_everything_can_be_said(lab, monkeypatch, capsys):
         field_radius_mm=(0.7,),
         name=("mine",),
     )
-    status, out, err = run(monkeypatch, capsys, "new-design", *everything, "-o", "my.toml")
+    status, out, err = run("new-design", *everything, "-o", "my.toml")
     assert (status, err) == (0, "") and "by default" not in out
     data = tomllib.loads((lab / "my.toml").read_text())
     assert data["name"] == "mine" and data["sensor"] == {"pixel_pitch_um": 3.45, "shape": [300, 400]}
@@ -91,21 +88,21 @@ def test_everything_can_be_said(lab, monkeypatch, capsys):
     }
 
 
-def test_a_random_layout(folder, monkeypatch, capsys):
+def test_a_random_layout(folder, run):
     made = options(centers=None, count=(30,), shape=(2000, 3000))
     for seed, same in ((0, True), (1, False)):
-        run(monkeypatch, capsys, "new-design", *made, "--seed", seed, "-o", f"{seed}.toml")
-        run(monkeypatch, capsys, "new-design", *made, "-o", "again.toml", "--force")
+        run("new-design", *made, "--seed", seed, "-o", f"{seed}.toml")
+        run("new-design", *made, "-o", "again.toml", "--force")
         first, again = (read_design(name).array.centers_mm for name in (f"{seed}.toml", "again.toml"))
         assert len(first) == 30 and (first == again) is same
     assert read_design("0.toml").array.size_mm == (10.35, 6.9)
 
 
 @pytest.mark.parametrize("count", [200, 150, 30])
-def test_random_layouts_fit_the_plate_and_make_a_mold(folder, monkeypatch, capsys, count):
+def test_random_layouts_fit_the_plate_and_make_a_mold(folder, run, count):
     """Of a sensor whose half width has five decimals, with lenses that are cut in half nowhere, and no hemispheres."""
     made = options(centers=None, count=(count,), shape=(2608, 3478), focal_length_mm=(1.2,))
-    status, out, err = run(monkeypatch, capsys, "new-design", *made, "-o", "my.toml")
+    status, out, err = run("new-design", *made, "-o", "my.toml")
     assert (status, err) == (0, "")
     design = read_design("my.toml")
     from_edge = (np.array(design.array.size_mm) / 2 - np.abs(design.array.centers_mm)).min()
@@ -117,41 +114,41 @@ def test_random_layouts_fit_the_plate_and_make_a_mold(folder, monkeypatch, capsy
     assert all(result.level != "error" for result in results)
 
 
-def test_lenses_that_no_mold_makes_are_named(lab, monkeypatch, capsys):
+def test_lenses_that_no_mold_makes_are_named(lab, run):
     steep = options(aperture_diameter_mm=(0.99,), focal_length_mm=None, radius_of_curvature_mm=(0.5,))
-    status, _, err = run(monkeypatch, capsys, "new-design", *steep, "--sensor-distance-mm", 1.2, "-o", "my.toml")
+    status, _, err = run("new-design", *steep, "--sensor-distance-mm", 1.2, "-o", "my.toml")
     assert status == 0 and "my.toml: `gs-jax mold` refuses it: `lens.aperture_diameter_mm` must be" in err
     assert err.count("\n") == 1
 
 
-def test_mirror_unit_columns_and_corner(lab, monkeypatch, capsys):
+def test_mirror_unit_columns_and_corner(lab, run):
     low = np.array([-0.5, -0.5])
     rows = "".join(f"{x:.6f} {y:.6f} 7\n" for x, y in (np.array(CENTERS) - low) / 0.00345)
     (lab / "own.txt").write_text("a b c\n" + rows)
     more = ("--centers-unit", "px", "--centers-columns", "a", "b", "--centers-origin", "corner", "--mirror")
-    status, _, err = run(monkeypatch, capsys, "new-design", *options(centers=("own.txt",)), *more, "-o", "my.toml")
+    status, _, err = run("new-design", *options(centers=("own.txt",)), *more, "-o", "my.toml")
     assert (status, err) == (0, "")
     middle = np.array([399, 299]) / 2 * 0.00345
     expected = (np.array(CENTERS) - low - middle) * [-1, 1]
     np.testing.assert_allclose(read_design("my.toml").array.centers_mm, expected, atol=1e-6)
 
 
-def test_lenses_beyond_the_sensor_are_left_out_on_demand(lab, monkeypatch, capsys):
+def test_lenses_beyond_the_sensor_are_left_out_on_demand(lab, run):
     (lab / "large.csv").write_text("x_mm,y_mm\n5,0\n" + "".join(f"{x},{y}\n" for x, y in CENTERS))
     large = options(centers=("large.csv",))
-    status, _, err = run(monkeypatch, capsys, "new-design", *large, "-o", "my.toml")
+    status, _, err = run("new-design", *large, "-o", "my.toml")
     assert status == 2 and "large.csv: 1 of 5 lenses are beyond the sensor's reach" in err and "--crop" in err
-    status, out, err = run(monkeypatch, capsys, "new-design", *large, "--crop", "-o", "my.toml")
+    status, out, err = run("new-design", *large, "--crop", "-o", "my.toml")
     assert (status, err) == (0, "") and "left out: 1 lenses" in out
     assert read_design("my.toml").array.centers_mm == CENTERS
 
 
-def test_which_are_beyond_depends_on_the_turn(lab, monkeypatch, capsys):
+def test_which_are_beyond_depends_on_the_turn(lab, run):
     """Along the short side of the sensor, which a quarter turn makes the long one."""
     (lab / "long.csv").write_text("x_mm,y_mm\n0,1.1\n0,-1.1\n0.1,0\n-0.1,0\n")
     long = options(centers=("long.csv",), field_radius_mm=(1.5,))
     for angle, status in ((0, 2), (90, 0), (-90, 0)):
-        done, _, err = run(monkeypatch, capsys, "new-design", *long, "--rotation-deg", angle, "-o", f"{angle}.toml")
+        done, _, err = run("new-design", *long, "--rotation-deg", angle, "-o", f"{angle}.toml")
         assert done == status, err
     assert read_design("90.toml").calibration.rotation_deg == 90.0
 
@@ -180,30 +177,30 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("words", "changed"), WRONG, ids=[" ".join(changed) for _, changed in WRONG])
-def test_wrong_options_are_one_line(lab, monkeypatch, capsys, words, changed):
+def test_wrong_options_are_one_line(lab, run, words, changed):
     (lab / "bare.csv").write_text("-400,-200\n300,100\n")
     (lab / "corner.csv").write_text("0.4,0.2\n0.3,0.1\n")
     before = sorted(lab.iterdir())
-    status, out, err = run(monkeypatch, capsys, "new-design", *options(**changed), "-o", "my.toml")
+    status, out, err = run("new-design", *options(**changed), "-o", "my.toml")
     assert (status, out, err.count("\n")) == (2, "", 1) and len(err) < 400
     assert all(word in err for word in words), err
     assert sorted(lab.iterdir()) == before
 
 
-def test_a_slip_is_asked_about_and_written(lab, monkeypatch, capsys):
+def test_a_slip_is_asked_about_and_written(lab, run):
     """Nobody is there to answer; what is possible is done."""
     slipped = options(sensor_distance_mm=(5800,))
-    status, _, err = run(monkeypatch, capsys, "new-design", *slipped, "-o", "my.toml")
+    status, _, err = run("new-design", *slipped, "-o", "my.toml")
     question = "imaging.sensor_distance_mm = 5800: did you mean 5.8 mm (5800 um)?"
     assert status == 0 and err == f"gs-jax: my.toml: {question}\n"
 
 
-def test_nothing_is_replaced_unasked(lab, monkeypatch, capsys):
+def test_nothing_is_replaced_unasked(lab, run):
     (lab / "my.toml").write_text("mine")
-    status, _, err = run(monkeypatch, capsys, "new-design", *options(), "-o", "my.toml")
+    status, _, err = run("new-design", *options(), "-o", "my.toml")
     assert status == 2 and "--force" in err and (lab / "my.toml").read_text() == "mine"
-    assert run(monkeypatch, capsys, "new-design", *options(), "-o", "my.toml", "--force")[0] == 0
-    status, _, err = run(monkeypatch, capsys, "new-design", *options(), "-o", "vendor.csv", "--force")
+    assert run("new-design", *options(), "-o", "my.toml", "--force")[0] == 0
+    status, _, err = run("new-design", *options(), "-o", "vendor.csv", "--force")
     assert status == 2 and ".toml" in err
 
 
@@ -323,10 +320,10 @@ def refused_by(node: Any, value: Any, top: Any) -> str | None:
     return "length" if isinstance(value, str) and len(value) < node.get("minLength", 0) else None
 
 
-def test_the_schema_takes_what_is_shipped(folder, monkeypatch, capsys):
+def test_the_schema_takes_what_is_shipped(folder, run):
     from gs_jax.cli.options import shipped_designs
 
-    status, out, err = run(monkeypatch, capsys, "new-design", "--schema")
+    status, out, err = run("new-design", "--schema")
     made = json.loads(out)
     assert (status, err) == (0, "") and made == json.loads(json.dumps(schema()))
     assert "null" not in out and "prefixItems" not in out

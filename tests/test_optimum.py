@@ -198,20 +198,9 @@ def test_wrong_arguments_are_named(function, arguments, words):
         function(*arguments)
 
 
-OBJECTIVES = (
-    "spot_width",
-    "encircled_radius",
-    "half_light_radius",
-    "width_per_light",
-    "strehl",
-    "lateral_resolution",
-    "axial_resolution",
-    "depth_of_field",
-    "blur",
-    "occupancy",
-    "light",
-    "lenses_per_point",
-    "coverage",
+OBJECTIVES = tuple(
+    "spot_width encircled_radius half_light_radius width_per_light strehl lateral_resolution axial_resolution "
+    "depth_of_field blur occupancy light lenses_per_point coverage".split()
 )
 
 

@@ -13,9 +13,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from gs_jax import Grid, show
 from gs_jax.apps.pictures import PALETTE, downsample, draw_image, label_of, line_of, make_slices
 
-from .browser import browser, watched
-
-__all__ = ["browser"]
+from .browser import watched
 
 GRID = Grid([18.0, 18.5, 20.0, 22.0], (31, 41), 0.05, (1.0, -2.0))
 

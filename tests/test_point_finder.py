@@ -11,37 +11,31 @@ import pytest
 import tifffile
 from scipy.spatial import KDTree
 
+import gs_jax as gs
 from experiments import point_density
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
-from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import read_design
-from gs_jax.design.start import geomscope
 from gs_jax.detection.particles import find_clusters
-from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.view_samples import detection_stats
-from gs_jax.metrics import localization
 from gs_jax.microscope.layouts import interleave
 from gs_jax.optics.apertures import clear_area
-from gs_jax.simulation import Camera, expose, random_points, simulate, simulate_points
+from gs_jax.simulation import random_points, simulate_points
 
 from .helpers import compilations, needs
 
 
-def small() -> tuple[Imager, Grid]:
+def small() -> tuple[gs.Imager, gs.Grid]:
     """49 ideal lenses, 7 x 7 mm, in focus at 20 mm; a point is seen by about 12. Their cores are on the chief rays."""
     rng = np.random.default_rng(0)
     row, column = np.mgrid[:7, :7]
     centers = np.stack([column, row], -1).reshape(-1, 2) - 3.0 + rng.uniform(-0.3, 0.3, (49, 2))
-    array = MicrolensArray(centers, thin_lens_focal_length=4.5, size=(7.0, 7.0))
-    imager = Imager(array, Sensor((896, 960), 0.009), 5.75, 2.0)
-    return imager, Grid(np.arange(19.0, 21.01, 0.25), (181, 181), 0.03)
+    array = gs.MicrolensArray(centers, thin_lens_focal_length=4.5, size=(7.0, 7.0))
+    imager = gs.Imager(array, gs.Sensor((896, 960), 0.009), 5.75, 2.0)
+    return imager, gs.Grid(np.arange(19.0, 21.01, 0.25), (181, 181), 0.03)
 
 
 @cache
 def rendered(points: tuple) -> np.ndarray:
     imager, _ = small()
-    return simulate_points(np.array(points), imager, kind="geometric", progress=Progress())
+    return simulate_points(np.array(points), imager, kind="geometric", progress=gs.Progress())
 
 
 def image_of(points) -> np.ndarray:
@@ -49,27 +43,27 @@ def image_of(points) -> np.ndarray:
 
 
 def capture_of(points, *, electrons=3000, key=0) -> np.ndarray:
-    return np.array(expose(image_of(points), Camera(), jax.random.key(key), peak_electrons=electrons))
+    return np.array(gs.expose(image_of(points), gs.Camera(), jax.random.key(key), peak_electrons=electrons))
 
 
 def find(image, grid=None) -> np.ndarray:
     imager, default = small()
-    return find_points(image, imager, default if grid is None else grid, progress=Progress())
+    return gs.find_points(image, imager, default if grid is None else grid, progress=gs.Progress())
 
 
 def test_other_numbers_find_the_programs():
     """Another image, and another microscope and depths whose magnification is the same: no compilation."""
     imager, grid = small()
     points = np.array([[0.3, -0.4, 20.2, 1.0], [-0.9, 0.8, 19.6, 0.8]])
-    first = find_points(image_of(points), imager, grid)
+    first = gs.find_points(image_of(points), imager, grid)
     other = eqx.tree_at(
         lambda i: (i.array.centers, i.array.thin_lens_focal_length), imager, replace_fn=lambda x: 1.01 * x
     )
     before = compilations()
-    find_points(image_of(points)[::-1], imager, grid)
-    find_points(image_of(points), other, Grid([18.9, 20.0, 21.1], (91, 91), 0.06))
+    gs.find_points(image_of(points)[::-1], imager, grid)
+    gs.find_points(image_of(points), other, gs.Grid([18.9, 20.0, 21.1], (91, 91), 0.06))
     assert compilations() == before
-    np.testing.assert_array_equal(find_points(image_of(points), imager, grid), first)
+    np.testing.assert_array_equal(gs.find_points(image_of(points), imager, grid), first)
 
 
 def many() -> np.ndarray:
@@ -89,9 +83,9 @@ LATERAL, AXIAL = 0.01, 0.1
 def test_points_are_found_placed_and_measured():
     truth = many()
     image = image_of(truth)
-    scale = 3000 / image.max() / float(Camera().gain)  # what the camera makes of an intensity of 1, counts
+    scale = 3000 / image.max() / float(gs.Camera().gain)  # what the camera makes of an intensity of 1, counts
     found = find(capture_of(truth))
-    score = localization(found, truth)
+    score = gs.localization(found, truth)
     assert score.f1 == 1
     assert score.lateral_rmse < LATERAL and score.axial_rmse < AXIAL
     # Of all that a point sends out, a lens on its axis has the solid angle of its aperture.
@@ -120,12 +114,12 @@ def test_an_uneven_haze_does_not_matter():
     row, column = np.mgrid[: image.shape[0], : image.shape[1]]
     haze = np.exp(-((row - 300) ** 2 + (column - 600) ** 2) / (2 * 250**2))
     hazy = image + haze * image.sum() / haze.sum()
-    capture = np.asarray(expose(hazy, Camera(), jax.random.key(0), peak_electrons=3000))
-    score = localization(find(capture), truth)
+    capture = np.asarray(gs.expose(hazy, gs.Camera(), jax.random.key(0), peak_electrons=3000))
+    score = gs.localization(find(capture), truth)
     assert score.f1 == 1 and score.lateral_rmse < LATERAL and score.axial_rmse < AXIAL
     # Without haze and noise, and the same each time.
     found = find(image)
-    assert localization(found, truth).f1 == 1
+    assert gs.localization(found, truth).f1 == 1
     np.testing.assert_array_equal(found, find(image))
 
 
@@ -156,22 +150,24 @@ def test_two_points_close_together_are_two(axis, distance):
     truth = np.array([[0.3, -0.2, 20.0, 1.0]] * 2)
     truth[:, axis] += distance * np.array([-0.5, 0.5])
     found = find(capture_of(truth))
-    score = localization(found, truth, lateral=0.03, axial=0.2)
+    score = gs.localization(found, truth, lateral=0.03, axial=0.2)
     assert len(found) == 2 and score.recall == 1
 
 
 @pytest.mark.slow
 def test_a_spot_that_is_a_ring_is_one_point():
     """Two of these points are out of focus, and the rim of their spots is as bright as the middle."""
-    truth, capture = point_density.scene(10, 0, geomscope(), Progress())
-    imager = geomscope().imager()
-    found = find_points(capture, imager, Grid.over(imager.sensor, depths=[17.0, 23.0], pitch=0.03), progress=Progress())
-    assert len(found) == 10 and localization(found, truth).f1 == 1
+    truth, capture = point_density.scene(10, 0, gs.geomscope(), gs.Progress())
+    imager = gs.geomscope().imager()
+    found = gs.find_points(
+        capture, imager, gs.Grid.over(imager.sensor, depths=[17.0, 23.0], pitch=0.03), progress=gs.Progress()
+    )
+    assert len(found) == 10 and gs.localization(found, truth).f1 == 1
 
 
 def test_what_is_beside_a_wide_spot_is_no_point():
     """A bright point nearer than all others, in water: spherical aberration widens its spots, theirs are sharp."""
-    design = geomscope()
+    design = gs.geomscope()
     centers = np.array(design.array.centers_mm)
     centers = centers[np.argsort(np.abs(centers).max(1), kind="stable")[:16]]
     side = 2 * np.abs(centers).max() + 1.2
@@ -181,11 +177,11 @@ def test_what_is_beside_a_wide_spot_is_no_point():
     truth = np.array(
         [[0.165, -0.275, 17.4, 5.0], [-0.55, -0.58, 20.5, 5.0], [0.38, 0.5, 21.0, 4.0], [0.13, 0.275, 21.5, 3.0]]
     )
-    image = simulate(truth, imager, optics="near", psf="geometric")
-    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=10_000))
-    found = find_points(capture, imager, Grid([17.0, 22.0], (101, 101), 0.03))
+    image = gs.simulate(truth, imager, optics="near", psf="geometric")
+    capture = np.asarray(gs.expose(image, gs.Camera(), jax.random.key(0), peak_electrons=10_000))
+    found = gs.find_points(capture, imager, gs.Grid([17.0, 22.0], (101, 101), 0.03))
     # The images are centred on chief rays, not on the cores that are searched for: 0.3 mm.
-    assert len(found) == len(truth) and localization(found, truth).f1 == 1
+    assert len(found) == len(truth) and gs.localization(found, truth).f1 == 1
 
 
 @pytest.mark.integration
@@ -197,17 +193,17 @@ def test_what_only_half_of_the_lenses_see_is_a_ghost():
     image = np.zeros(imager.sensor.shape, np.float32)
     for point, mask in zip(points, left, strict=True):
         half = eqx.tree_at(lambda i: i.array.centers, imager, imager.array.centers[mask])
-        image += simulate_points(point[None], half, kind="geometric", progress=Progress())
-    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=3000))
+        image += simulate_points(point[None], half, kind="geometric", progress=gs.Progress())
+    capture = np.asarray(gs.expose(image, gs.Camera(), jax.random.key(0), peak_electrons=3000))
     assert len(find(capture)) == 0
-    volume = backproject(capture.astype(np.float32), imager, grid)
+    volume = gs.backproject(capture.astype(np.float32), imager, grid)
     assert len(find_clusters(volume, grid, noise_floor=0)) >= 2
 
 
 @pytest.mark.integration
 def test_points_of_two_foci():
     """All of the light and noise; one type is in focus at 20 mm, the other at 27 mm, about 23 mm both are read."""
-    design = geomscope()
+    design = gs.geomscope()
     centers = np.array(design.array.centers_mm)
     centers = centers[np.argsort(np.abs(centers).max(1), kind="stable")[:32]]
     side = 2 * np.abs(centers).max() + 1.2
@@ -217,10 +213,10 @@ def test_points_of_two_foci():
     truth = random_points(20, (2.4, 2.4), (18.5, 29.5), seed=0)
     # Cores are traced once for each depth.
     truth[:, 2] = np.linspace(18.8, 29.3, 7)[np.arange(20) % 7]
-    image = simulate(truth, imager)
-    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=2e4))
-    found = find_points(capture, imager, Grid.over(imager.sensor, depths=[18.0, 30.0], pitch=0.1))
-    score = localization(found, truth, lateral=0.045, axial=0.43)
+    image = gs.simulate(truth, imager)
+    capture = np.asarray(gs.expose(image, gs.Camera(), jax.random.key(0), peak_electrons=2e4))
+    found = gs.find_points(capture, imager, gs.Grid.over(imager.sensor, depths=[18.0, 30.0], pitch=0.1))
+    score = gs.localization(found, truth, lateral=0.045, axial=0.43)
     assert score.f1 >= 0.95
     # A third of a pixel in the object, and what moves a spot of the outer lenses by as much.
     assert score.lateral_rmse < 0.012 and score.axial_rmse < 0.1
@@ -236,7 +232,7 @@ def test_two_lenses_may_be_blocked():
     for lens in np.argsort(distance)[:2]:
         row, column = pixels[lens].astype(int)
         capture[row - 40 : row + 40, column - 40 : column + 40] = 16
-    score = localization(find(capture), truth)
+    score = gs.localization(find(capture), truth)
     assert score.f1 == 1 and score.lateral_rmse < LATERAL
 
 
@@ -246,21 +242,21 @@ def test_the_voxels_do_not_matter_and_the_box_does():
     _, grid = small()
     fine = find(capture)
     np.testing.assert_array_equal(fine, find(capture, grid.at(grid.depths[::-1])))
-    coarse = find(capture, Grid([19.0, 21.0], (45, 45), 0.12))
-    assert localization(coarse, fine, lateral=0.01, axial=0.05).f1 == 1
-    half = find(capture, Grid(grid.depths, (91, 181), 0.03))
-    assert localization(half, truth[np.abs(truth[:, 1]) < 1.365]).f1 == 1
-    deep = find(capture, Grid([20.0, 21.0], grid.shape, grid.pitch))
-    assert localization(deep, fine[fine[:, 2] > 20.1], axial=0.1).recall == 1
+    coarse = find(capture, gs.Grid([19.0, 21.0], (45, 45), 0.12))
+    assert gs.localization(coarse, fine, lateral=0.01, axial=0.05).f1 == 1
+    half = find(capture, gs.Grid(grid.depths, (91, 181), 0.03))
+    assert gs.localization(half, truth[np.abs(truth[:, 1]) < 1.365]).f1 == 1
+    deep = find(capture, gs.Grid([20.0, 21.0], grid.shape, grid.pitch))
+    assert gs.localization(deep, fine[fine[:, 2] > 20.1], axial=0.1).recall == 1
     assert (deep[:, 2] > 19.8).all()
     plane = np.array([[0.5, 0.5, 20.0, 1.0], [-0.5, 0.0, 20.0, 1.0]])
-    assert localization(find(capture_of(plane), Grid([20.0], grid.shape, grid.pitch)), plane).f1 == 1
+    assert gs.localization(find(capture_of(plane), gs.Grid([20.0], grid.shape, grid.pitch)), plane).f1 == 1
 
 
 def test_without_a_lens_in_reach_nothing_is_found():
     imager, grid = small()
-    far = Imager(MicrolensArray([[50.0, 0.0], [51.0, 0.0], [50.0, 1.0]]), imager.sensor, 5.75, 2.0)
-    assert len(find_points(capture_of(many()), far, grid, progress=Progress())) == 0
+    far = gs.Imager(gs.MicrolensArray([[50.0, 0.0], [51.0, 0.0], [50.0, 1.0]]), imager.sensor, 5.75, 2.0)
+    assert len(gs.find_points(capture_of(many()), far, grid, progress=gs.Progress())) == 0
 
 
 def test_a_wrong_image_is_named():
@@ -269,12 +265,12 @@ def test_a_wrong_image_is_named():
     spoilt = np.ones((896, 960))
     spoilt[:2, 0] = np.nan, np.inf
     for search in (find, lambda image: detection_stats(np.array([[0.0, 0.0, 20.0, 1.0]]), image, *small())):
-        with pytest.raises(InputError, match="image must be finite, got 2 of 860160 pixels NaN"):
+        with pytest.raises(gs.InputError, match="image must be finite, got 2 of 860160 pixels NaN"):
             search(spoilt)
-    with pytest.raises(InputError, match="image must be real, got complex numbers"):
+    with pytest.raises(gs.InputError, match="image must be real, got complex numbers"):
         find(np.ones((896, 960), complex))
-    with pytest.raises(InputError, match="imager must be an Imager, as .*, got <class"):
-        inspect.unwrap(find_points)(spoilt, Imager, small()[1])
+    with pytest.raises(gs.InputError, match="imager must be an Imager, as .*, got <class"):
+        inspect.unwrap(gs.find_points)(spoilt, gs.Imager, small()[1])
 
 
 # Ray-traced captures: the independent check.
@@ -287,11 +283,11 @@ def test_ray_traced_points_are_found_and_nothing_else(scene):
     needs("geomscope/centers.csv")
     data = needs("oracle/dev/P1.toml").parent
     truth = np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])
-    imager = read_design(data / "P1.toml").imager()
-    grid = Grid.over(imager.sensor, depths=np.arange(17, 23.01, 0.25), pitch=0.03)
+    imager = gs.read_design(data / "P1.toml").imager()
+    grid = gs.Grid.over(imager.sensor, depths=np.arange(17, 23.01, 0.25), pitch=0.03)
     capture = tifffile.imread(data / f"P1_{scene}.tif")
-    found = find_points(capture, imager, grid, progress=Progress())
-    score = localization(found, truth)
+    found = gs.find_points(capture, imager, grid, progress=gs.Progress())
+    score = gs.localization(found, truth)
     assert score.f1 == 1
     assert score.lateral_rmse <= 0.015 and score.axial_rmse <= (0.12 if scene == "d" else 0.2)
 
@@ -306,13 +302,13 @@ def test_scores_of_several_captures_are_those_of_all_their_points():
 @pytest.mark.integration
 def test_no_point_is_found_where_none_is_among_beads_of_many_intensities():
     """Two draws of 20 beads in each medium: in water one profile of all spots left four points beside beads."""
-    for row in point_density.draws(geomscope(), 2, (20,), progress=Progress()):
+    for row in point_density.draws(gs.geomscope(), 2, (20,), progress=gs.Progress()):
         assert row["false"] == 0 and row["recall"] >= 0.95
         assert row["lateral_rmse_um"] <= 5 and row["axial_rmse_um"] <= 60
 
 
 @pytest.mark.slow
 def test_a_hundred_simulated_points_are_found():
-    (row,) = point_density.run(geomscope(), {100: 1}, progress=Progress())
+    (row,) = point_density.run(gs.geomscope(), {100: 1}, progress=gs.Progress())
     assert row["gs_jax"]["f1"] >= 0.95
     assert row["gs_jax"]["lateral_rmse_um"] <= 15 and row["gs_jax"]["axial_rmse_um"] <= 120

@@ -11,9 +11,7 @@ import pytest
 from gs_jax.base import machine, progress as module
 from gs_jax.base.progress import QUIET, VERBOSE, CancellableProgress, Cancelled, Progress, verbosity
 
-from .test_cli import RECONSTRUCT, folder
-
-__all__ = ["folder"]
+from .test_cli import RECONSTRUCT
 
 
 @pytest.fixture(autouse=True)

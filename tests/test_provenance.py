@@ -9,31 +9,27 @@ import tifffile
 from click.testing import CliRunner
 
 import gs_jax as gs
-from gs_jax import Grid, InputError
 from gs_jax.__main__ import commands
 from gs_jax.base.weights import load_weights, save_weights
 from gs_jax.design.design import design_text
-from gs_jax.io.captures import read_capture, write_capture
-from gs_jax.io.point_tables import read_points, write_points
 from gs_jax.io.provenance import DepthFrame, made_by, read_provenance, sidecar
-from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.mold.export import Mesh, read_mesh, write_mesh
 from gs_jax.widget.layers import reader
 
 ORIGIN = {"software": "gs_jax 1", "command": "gs-jax 'a <b> & \"c\"'", "design": 'name = "µ"\n\n[sensor]\n'}
 VOXELS = np.random.default_rng(0).random((3, 5, 4), np.float32)
-GRID = Grid([18.0, 18.5, 19.0], (5, 4), 0.04)
+GRID = gs.Grid([18.0, 18.5, 19.0], (5, 4), 0.04)
 TETRAHEDRON = Mesh(
     np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32),
     np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
 )
 WRITE = {
-    "v.ome.tif": lambda path, **o: write_volume(path, VOXELS, GRID, **o),
-    "v.zarr": lambda path, **o: write_volume(path, VOXELS, GRID, **o),
-    "c.tif": lambda path, **o: write_capture(path, VOXELS[0], **o),
-    "c.npy": lambda path, **o: write_capture(path, VOXELS[0], **o),
-    "c.png": lambda path, **o: write_capture(path, np.ones((5, 4), np.uint16), **o),
-    "p.csv": lambda path, **o: write_points(path, np.ones((2, 4)), **o),
+    "v.ome.tif": lambda path, **o: gs.write_volume(path, VOXELS, GRID, **o),
+    "v.zarr": lambda path, **o: gs.write_volume(path, VOXELS, GRID, **o),
+    "c.tif": lambda path, **o: gs.write_capture(path, VOXELS[0], **o),
+    "c.npy": lambda path, **o: gs.write_capture(path, VOXELS[0], **o),
+    "c.png": lambda path, **o: gs.write_capture(path, np.ones((5, 4), np.uint16), **o),
+    "p.csv": lambda path, **o: gs.write_points(path, np.ones((2, 4)), **o),
     "w.npz": lambda path, **o: save_weights(path, np.ones(3), {"n": 1}, **o),
     "m.3mf": lambda path, **o: write_mesh(path, TETRAHEDRON, "a <part>", **o),
 }
@@ -47,8 +43,8 @@ def test_a_file_says_where_it_comes_from(tmp_path, name):
     shown = CliRunner().invoke(commands, ["info", str(path)])
     assert shown.exit_code == 0 and ORIGIN["command"] in shown.stdout
     # What the file holds can be read.
-    read = {".npz": lambda path: load_weights(path, lambda n: np.zeros(3)), ".csv": read_points, ".3mf": read_mesh}
-    read.get(path.suffix, read_volume if name.startswith("v") else read_capture)(path)
+    read = {".npz": lambda path: load_weights(path, lambda n: np.zeros(3)), ".csv": gs.read_points, ".3mf": read_mesh}
+    read.get(path.suffix, gs.read_volume if name.startswith("v") else gs.read_capture)(path)
     WRITE[name](path)
     assert read_provenance(path) == {}
     assert [each.name for each in tmp_path.iterdir()] == [name]
@@ -104,17 +100,17 @@ def test_commands_sign_what_they_write(tmp_path):
 
 
 def test_another_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="suffix must be .tif.*got '.txt'"):
+    with pytest.raises(gs.InputError, match="suffix must be .tif.*got '.txt'"):
         read_provenance(tmp_path / "a.txt")
     (tmp_path / "a.tif").write_bytes(b"no")
-    with pytest.raises(InputError, match="not a whole and valid .tif file"):
+    with pytest.raises(gs.InputError, match="not a whole and valid .tif file"):
         read_provenance(tmp_path / "a.tif")
 
 
 def test_imagej_reads_the_scale(tmp_path):
     """Its reader takes the last description, if that begins with its name, and pixels in one piece."""
     path = tmp_path / "v.ome.tif"
-    write_volume(path, VOXELS, GRID)
+    gs.write_volume(path, VOXELS, GRID)
     with tifffile.TiffFile(path) as tiff:
         first = tiff.pages.first
         entries = [tag.code for tag in first.tags]
@@ -134,7 +130,7 @@ def test_imagej_reads_the_scale(tmp_path):
 @pytest.mark.parametrize("voxels, shown", [(VOXELS, (0, 1)), (np.zeros((3, 5, 4)), (0, 1)), (VOXELS > 0.99, (0, 1))])
 def test_viewers_are_told_what_to_show(tmp_path, voxels, shown):
     path = tmp_path / "v.zarr"
-    write_volume(path, voxels, GRID)
+    gs.write_volume(path, voxels, GRID)
     (channel,) = json.loads((path / ".zattrs").read_text())["omero"]["channels"]
     start, end = channel["window"]["start"], channel["window"]["end"]
     assert channel["label"] == "v" and shown[0] <= start < end <= shown[1]
@@ -142,11 +138,11 @@ def test_viewers_are_told_what_to_show(tmp_path, voxels, shown):
 
 def test_napari_shows_volume_and_points_in_one_place(tmp_path):
     """Both in um; a point lies in the voxel of its place."""
-    grid = Grid([18.0, 18.5, 19.0], (5, 4), 0.04, (1.0, -2.0))
+    grid = gs.Grid([18.0, 18.5, 19.0], (5, 4), 0.04, (1.0, -2.0))
     place = grid.to_mm(np.array([[1, 3, 2]]))
-    write_points(tmp_path / "p.csv", np.column_stack([place, [1.0]]), {"lenses": np.array([7])})
+    gs.write_points(tmp_path / "p.csv", np.column_stack([place, [1.0]]), {"lenses": np.array([7])})
     for name in ("v.ome.tif", "v.zarr"):
-        write_volume(tmp_path / name, VOXELS, grid)
+        gs.write_volume(tmp_path / name, VOXELS, grid)
         (voxels, image, kind), (points, marks, other) = (
             read(str(tmp_path / each))[0] for each in (name, "p.csv") if (read := reader(str(tmp_path / each)))
         )

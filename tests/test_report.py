@@ -28,10 +28,8 @@ from gs_jax.io.volumes import write_surface, write_volume
 from gs_jax.microscope.layouts import plate_corners
 from gs_jax.optics.raytrace import trace_lenslet
 
-from .browser import browser, watched
-from .test_cli import DESIGN, run
-
-__all__ = ["browser"]
+from .browser import watched
+from .helpers import DESIGN
 
 CALIBRATED = """
 [provenance]
@@ -203,13 +201,13 @@ def test_the_first_key_skips_to_the_content(made, browser):
         (("none.toml", "-o", "r.html"), "none.toml: "),
     ],
 )
-def test_wrong_input_is_one_line(made, tmp_path, monkeypatch, capsys, arguments, message):
+def test_wrong_input_is_one_line(made, tmp_path, run, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     for name in ("design.toml", "capture.tif", "points.csv"):
         (tmp_path / name).write_bytes((made / name).read_bytes())
     (tmp_path / "other.json").write_text("{}")
     tifffile.imwrite(tmp_path / "small.tif", np.zeros((5, 5), np.uint16))
-    status, out, err = run(monkeypatch, capsys, "report", *arguments)
+    status, out, err = run("report", *arguments)
     assert (status, out, err.count("\n")) == (2, "", 1) and message in err
     assert not (tmp_path / "r.html").exists()
 

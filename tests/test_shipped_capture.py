@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from gs_jax import Grid, Imager, backproject, forward
-from gs_jax.base.progress import Progress
-from gs_jax.design.design import read_design
-from gs_jax.detection.point_finder import find_points
-from gs_jax.io.captures import read_capture
-from gs_jax.io.point_tables import read_points
-from gs_jax.metrics import localization
+import gs_jax as gs
 
 from .helpers import CAPTURES
 
@@ -19,19 +13,19 @@ BLACK = 16  # The camera's value in the dark.
 
 
 @pytest.fixture(scope="module")
-def imager() -> Imager:
-    return read_design(CAPTURES / "crop.toml").imager()
+def imager() -> gs.Imager:
+    return gs.read_design(CAPTURES / "crop.toml").imager()
 
 
-def image_and_truth(name: str, imager: Imager) -> tuple[np.ndarray, np.ndarray]:
-    image = read_capture(CAPTURES / f"{name}.tif", imager.sensor.shape)
-    return np.asarray(image, np.float64) - BLACK, read_points(CAPTURES / f"{name}.csv")
+def image_and_truth(name: str, imager: gs.Imager) -> tuple[np.ndarray, np.ndarray]:
+    image = gs.read_capture(CAPTURES / f"{name}.tif", imager.sensor.shape)
+    return np.asarray(image, np.float64) - BLACK, gs.read_points(CAPTURES / f"{name}.csv")
 
 
 def test_back_projection_is_brightest_where_the_point_was(imager):
     image, ((x, y, z, _),) = image_and_truth("point", imager)
-    grid = Grid.over(imager.sensor, depths=z + np.arange(-0.4, 0.41, 0.1), pitch=0.02)
-    volume = np.asarray(backproject(image, imager, grid))
+    grid = gs.Grid.over(imager.sensor, depths=z + np.arange(-0.4, 0.41, 0.1), pitch=0.02)
+    volume = np.asarray(gs.backproject(image, imager, grid))
     ((*lateral, depth),) = grid.to_mm(np.argwhere(volume == volume.max()))
     np.testing.assert_allclose(lateral, (x, y), atol=0.02)  # a voxel
     assert abs(depth - z) <= 0.1  # aberrations focus nearer or farther than the chief rays cross
@@ -40,8 +34,8 @@ def test_back_projection_is_brightest_where_the_point_was(imager):
 def test_forward_puts_light_where_rays_put_it(imager):
     """For each lens up to 2 mm beside the point, the middle of the spot's core, and its light."""
     image, (point,) = image_and_truth("point", imager)
-    grid = Grid(point[2:3], (1, 1), 0.01, point[:2])
-    ours = np.asarray(forward(np.ones((1, 1, 1)), imager, grid))
+    grid = gs.Grid(point[2:3], (1, 1), 0.01, point[:2])
+    ours = np.asarray(gs.forward(np.ones((1, 1, 1)), imager, grid))
     pixels = np.asarray(imager.sensor.to_pixels(imager.project(point[None, :3])[:, 0]))
     beside = np.hypot(*(np.asarray(imager.centers) - point[:2]).T)
     spots = [core(image, at, 20) for at in pixels[beside <= 2]]
@@ -69,12 +63,12 @@ def core(image: np.ndarray, near: np.ndarray, reach: int) -> tuple[np.ndarray, f
 def test_points_are_found_and_nothing_else(imager, name):
     """The bars of the whole captures; points beside the sensor throw light on it and are not to be found."""
     image, truth = image_and_truth(name, imager)
-    grid = Grid.over(imager.sensor, depths=np.arange(17.0, 23.01, 0.25), pitch=0.03)
+    grid = gs.Grid.over(imager.sensor, depths=np.arange(17.0, 23.01, 0.25), pitch=0.03)
     left, right, bottom, top = grid.extent
     x, y = truth[:, 0], truth[:, 1]
     truth = truth[(left <= x) & (x <= right) & (top <= y) & (y <= bottom)]
-    found = find_points(image, imager, grid, progress=Progress())
-    score = localization(found, truth)
+    found = gs.find_points(image, imager, grid, progress=gs.Progress())
+    score = gs.localization(found, truth)
     assert score.f1 == 1 and len(truth) == {"point": 1, "points": 12}[name]
     assert score.lateral_rmse <= 0.015 and score.axial_rmse <= 0.12
     of_found, of_truth = score.pairs.T

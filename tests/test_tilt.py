@@ -11,22 +11,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+import gs_jax as gs
 from experiments.ray_tracer import bundles, traced
 from experiments.true_image import scores
-from gs_jax import (
-    Grid,
-    Imager,
-    Layers,
-    MicrolensArray,
-    Sample,
-    Sensor,
-    backproject,
-    find_points,
-    forward,
-    objectives,
-    random_layout,
-    simulate,
-)
 from gs_jax.codesign.linear_error import lost_power
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.projection.point_sources import forward_points, make_stamps
@@ -38,9 +25,9 @@ PLACES = np.random.default_rng(0).uniform(-4, 4, (20, 2))
 POINT = np.array([[0.7, -1.1, 19.0]])
 
 
-def tilted(tilt: Any = TILT) -> Imager:
-    return Imager(
-        MicrolensArray(PLACES), Sensor((700, 720), 0.016), 5.8, 2.5, rotation=0.3, shift=(0.1, 0.2), tilt=tilt
+def tilted(tilt: Any = TILT) -> gs.Imager:
+    return gs.Imager(
+        gs.MicrolensArray(PLACES), gs.Sensor((700, 720), 0.016), 5.8, 2.5, rotation=0.3, shift=(0.1, 0.2), tilt=tilt
     )
 
 
@@ -71,14 +58,14 @@ def test_chief_rays_are_straight_lines_through_the_vertices():
 
 LAYERS = {
     "no layers": {},
-    "filter": {"filters": Layers([2.0], [1.52])},
-    "gel": {"sample": Sample(1.43, surface=17.5)},
+    "filter": {"filters": gs.Layers([2.0], [1.52])},
+    "gel": {"sample": gs.Sample(1.43, surface=17.5)},
     "filter, cover slip and gel": {
-        "filters": Layers([2.0], [1.52]),
-        "sample": Sample(1.43, surface=17.5, layers=Layers([0.17], [1.523])),
+        "filters": gs.Layers([2.0], [1.52]),
+        "sample": gs.Sample(1.43, surface=17.5, layers=gs.Layers([0.17], [1.523])),
     },
-    "windows": {"windows": Layers([0.6, 0.55], [1.0, 1.51])},
-    "gel in contact": {"filters": Layers([2.0], [1.52]), "sample": Sample(1.43)},
+    "windows": {"windows": gs.Layers([0.6, 0.55], [1.0, 1.51])},
+    "gel in contact": {"filters": gs.Layers([2.0], [1.52]), "sample": gs.Sample(1.43)},
 }
 
 
@@ -88,11 +75,11 @@ LAYERS = {
 def test_a_tilt_moves_spots_as_rays_do(layers, orientation):
     """By a plate and filters that tilt, and samples that are level or tilt. The map of no tilt is paraxial."""
     centers = np.array([[0.0, 0.0], [1.0, 0.5], [-0.8, 1.0], [4.0, -3.0], [5.0, -2.0]])
-    lenses = MicrolensArray(centers, aperture_diameter=0.02, orientation=orientation)
+    lenses = gs.MicrolensArray(centers, aperture_diameter=0.02, orientation=orientation)
     points = np.array([[0.0, 0.0, 18.0], [0.5, -0.3, 20.0], [4.1, -2.6, 22.0]])
     errors = []
     for tilt in (None, (0.0175, -0.0105)):
-        imager = Imager(lenses, Sensor((600, 600), 0.013), 5.3, 2.0, tilt=tilt, **LAYERS[layers])
+        imager = gs.Imager(lenses, gs.Sensor((600, 600), 0.013), 5.3, 2.0, tilt=tilt, **LAYERS[layers])
         landed, _ = bundles(points, imager, 400)
         light = landed[..., 2:]
         spots = (landed[..., :2] * light).sum(2) / np.maximum(light.sum(2), 1e-30)
@@ -111,8 +98,8 @@ def test_light_is_brightest_on_the_axis_that_leans():
     distance = 20.0 + float(imager.array.substrate_thickness)
     lean = to_numpy(imager).axis_offset(np.array([20.0]))[0]
     np.testing.assert_allclose(np.cross([*lean, distance], normal), 0, atol=1e-12)
-    alone = dataclasses.replace(imager, array=MicrolensArray([[0.0, 0.0]]), field_radius=1.0)
-    image = np.asarray(backproject(np.ones((700, 720)), alone, Grid([20.0], (161, 161), 0.02)))[0]
+    alone = dataclasses.replace(imager, array=gs.MicrolensArray([[0.0, 0.0]]), field_radius=1.0)
+    image = np.asarray(gs.backproject(np.ones((700, 720)), alone, gs.Grid([20.0], (161, 161), 0.02)))[0]
     row, column = np.unravel_index(image.argmax(), image.shape)
     center = to_numpy(alone).centers[0]
     assert np.abs((np.array([column, row]) - 80) * 0.02 - center - lean).max() < 0.02
@@ -120,14 +107,14 @@ def test_light_is_brightest_on_the_axis_that_leans():
 
 @pytest.mark.integration
 def test_no_tilt_and_a_tilt_of_zero_are_the_same():
-    grid, volume = Grid([18.0, 21.0], (61, 67), 0.1), np.random.default_rng(1).random((2, 61, 67))
-    image = [forward(volume, imager, grid) for imager in (tilted(None), tilted((0.0, 0.0)))]
+    grid, volume = gs.Grid([18.0, 21.0], (61, 67), 0.1), np.random.default_rng(1).random((2, 61, 67))
+    image = [gs.forward(volume, imager, grid) for imager in (tilted(None), tilted((0.0, 0.0)))]
     np.testing.assert_allclose(image[0], image[1], atol=1e-10)
     slopes = jax.grad(lambda tilt: jnp.sum(tilted_by(tilt).heights ** 2 + tilted_by(tilt).centers[:, 0]))(jnp.zeros(2))
     assert np.isfinite(slopes).all()
 
 
-def tilted_by(tilt) -> Imager:
+def tilted_by(tilt) -> gs.Imager:
     return eqx.tree_at(lambda i: i.tilt, tilted(), tilt)
 
 
@@ -141,9 +128,9 @@ def test_volume_is_that_of_the_literal_loop_at_every_depth(dtype, orientation):
     image = np.random.default_rng(4).random(imager.sensor.shape).astype(dtype)
     expected = backproject_loop(image, imager, grid)[0]
     tolerance = 1e-10 if dtype == jnp.float64 else 1e-3
-    np.testing.assert_allclose(backproject(image, imager, grid), expected, atol=tolerance * expected.max())
+    np.testing.assert_allclose(gs.backproject(image, imager, grid), expected, atol=tolerance * expected.max())
     volume = np.random.default_rng(5).random(grid.volume_shape).astype(dtype)
-    back = np.vdot(np.float64(image), np.float64(forward(volume, imager, grid)))
+    back = np.vdot(np.float64(image), np.float64(gs.forward(volume, imager, grid)))
     assert back == pytest.approx(np.vdot(np.float64(volume), expected), rel=tolerance)
 
 
@@ -153,10 +140,10 @@ def test_points_are_where_the_grid_has_them_and_are_found():
     rng = np.random.default_rng(3)
     imager = dataclasses.replace(
         tilted(),
-        array=MicrolensArray(rng.uniform(-5, 5, (60, 2)), thin_lens_focal_length=4.65),
-        sensor=Sensor((1200, 1200), 0.012),
+        array=gs.MicrolensArray(rng.uniform(-5, 5, (60, 2)), thin_lens_focal_length=4.65),
+        sensor=gs.Sensor((1200, 1200), 0.012),
     )
-    grid = Grid([18.0, 20.0, 22.0], (141, 141), 0.05)
+    grid = gs.Grid([18.0, 20.0, 22.0], (141, 141), 0.05)
     voxels = np.column_stack([rng.integers(0, 3, 12), rng.integers(20, 121, (12, 2))])
     volume = np.zeros(grid.volume_shape)
     volume[tuple(voxels.T)] = 1
@@ -165,12 +152,12 @@ def test_points_are_where_the_grid_has_them_and_are_found():
     drawn = forward_points(
         np.column_stack([grid.to_mm(voxels), np.ones(12)]), imager, make_stamps(np.asarray(grid.depths), spot)
     )
-    exact = np.asarray(forward(volume, imager, grid))
+    exact = np.asarray(gs.forward(volume, imager, grid))
     blurred = [gaussian_filter(np.asarray(image), 2) for image in (drawn, exact)]
     # Stamps lie on fifths of pixels: 0.14 with and without a tilt. Without the heights it would be above 1.
     assert np.linalg.norm(blurred[0] - blurred[1]) < 0.15 * np.linalg.norm(blurred[1])
     noisy = 1e4 * blurred[1] / blurred[1].max() + rng.normal(100, 5, exact.shape)
-    found = find_points(noisy, imager, grid)
+    found = gs.find_points(noisy, imager, grid)
     away = np.linalg.norm(found[:, None, :2] - grid.to_mm(voxels)[None, :, :2], axis=-1)
     # A pixel is 0.041 mm wide at the object.
     assert len(found) == 12 and np.median(away.min(0)) < 0.01 and away.min(0).max() < 0.08
@@ -179,28 +166,28 @@ def test_points_are_where_the_grid_has_them_and_are_found():
 def test_quantities_are_means_over_the_heights_of_the_lenses():
     """Each lens by itself as one of a level array, which is farther from the sensor and nearer to the object."""
     depths = np.array([18.0, 20.5, 23.0])
-    imager = dataclasses.replace(tilted((0.05, -0.03)), filters=Layers([2.0], [1.52]), sample=Sample(1.43, 17.5))
+    imager = dataclasses.replace(tilted((0.05, -0.03)), filters=gs.Layers([2.0], [1.52]), sample=gs.Sample(1.43, 17.5))
     level = dataclasses.replace(imager, tilt=None)
     one = []
-    focus = eqx.filter_jit(objectives.focus_distance)
+    focus = eqx.filter_jit(gs.objectives.focus_distance)
     for height in to_numpy(imager).heights:
-        alone = dataclasses.replace(level, sensor_distance=5.8 + height, sample=Sample(1.43, 17.5 - height))
+        alone = dataclasses.replace(level, sensor_distance=5.8 + height, sample=gs.Sample(1.43, 17.5 - height))
         one.append(np.asarray(focus(alone, depths - height)) - height)
     # The rule of three heights is exact for polynomials: of 20 lenses at random, to a hundredth of the change.
     expected, change = np.mean(one, 0), np.std(one, 0)
     np.testing.assert_allclose(focus(imager, depths), expected, atol=0.02 * change.max())
-    widths = [np.asarray(eqx.filter_jit(objectives.sensor_blur)(one, depths)) for one in (level, imager)]
+    widths = [np.asarray(eqx.filter_jit(gs.objectives.sensor_blur)(one, depths)) for one in (level, imager)]
     assert (np.abs(widths[1] / widths[0] - 1) > 1e-3).all()
-    slope = jax.jit(jax.grad(lambda tilt: objectives.sensor_blur(tilted_by(tilt), [20.0])[0]))(np.zeros(2))
+    slope = jax.jit(jax.grad(lambda tilt: gs.objectives.sensor_blur(tilted_by(tilt), [20.0])[0]))(np.zeros(2))
     assert np.isfinite(slope).all()
 
 
 def test_the_error_of_volumes_sees_the_pose():
     """Objects that turn and move with the array are seen as before; a tilt changes what is seen."""
     # Level too, but of the structure of those that lean: compiled once.
-    lenses = MicrolensArray(PLACES, size=(8.0, 8.0))
-    level = Imager(lenses, Sensor((700, 720), 0.016), 5.8, 2.5, tilt=(0.0, 0.0))
-    at = objectives.Conditions([19.0, 21.0])
+    lenses = gs.MicrolensArray(PLACES, size=(8.0, 8.0))
+    level = gs.Imager(lenses, gs.Sensor((700, 720), 0.016), 5.8, 2.5, tilt=(0.0, 0.0))
+    at = gs.objectives.Conditions([19.0, 21.0])
     place = np.array([[0.4, -0.7]])
     # An eighth of a turn, which permutes the directions of frequencies.
     turned = dataclasses.replace(level, rotation=np.pi / 4, shift=(0.2, -0.1))
@@ -215,10 +202,12 @@ def test_the_error_of_volumes_sees_the_pose():
 @pytest.mark.integration
 def test_rays_leave_no_more_unexplained_than_of_a_level_array():
     """Of a point's whole image. Without bands of height it is twice as much (0.33 for 0.17 and 0.19)."""
-    centers = random_layout(60, (9.0, 9.0), diameter=1.9, seed=1)
-    lenses, point = MicrolensArray(centers, aperture_diameter=1.9), np.array([[0.2, -0.1, 20.0, 1.0]])
+    centers = gs.random_layout(60, (9.0, 9.0), diameter=1.9, seed=1)
+    lenses, point = gs.MicrolensArray(centers, aperture_diameter=1.9), np.array([[0.2, -0.1, 20.0, 1.0]])
     errors = []
     for tilt in (None, (0.0175, -0.005)):
-        imager = Imager(lenses, Sensor((1000, 1000), 0.01), 5.8, 3.0, tilt=tilt, **LAYERS["filter, cover slip and gel"])
-        errors.append(scores(simulate(point, imager), traced(point, imager, 60_000))["bin_1"]["error"])
+        imager = gs.Imager(
+            lenses, gs.Sensor((1000, 1000), 0.01), 5.8, 3.0, tilt=tilt, **LAYERS["filter, cover slip and gel"]
+        )
+        errors.append(scores(gs.simulate(point, imager), traced(point, imager, 60_000))["bin_1"]["error"])
     assert errors[1] < 1.2 * errors[0]

@@ -38,8 +38,6 @@ from gs_jax.optics.diffraction import axial_strehl, strehl
 from gs_jax.optics.pupil import pupil_quadrature
 from gs_jax.optics.raytrace import to_numpy
 
-from .test_cli import run
-
 depth_errors = jax.jit(device_model.depth_errors)
 log_sharpness = eqx.filter_jit(device_model.log_sharpness)
 lens_squares, step_squares = jax.jit(device_model.lens_squares), jax.jit(device_model.step_squares)
@@ -303,10 +301,10 @@ def test_the_picture_and_the_numbers(outcome):
 
 
 @pytest.mark.integration
-def test_the_command(folder, monkeypatch, capsys):
+def test_the_command(folder, run):
     (folder / "made.toml").write_text("position_um = 1.0\ntilt_deg = 0.1\n")
     options = ("--tolerances", "made.toml", "--tilt-deg", 0.3, "--depths", "18:22:2", "--draws", 20, "-q")
-    status, out, err = run(monkeypatch, capsys, "tolerance", "design.toml", *options, "-o", "t.json")
+    status, out, err = run("tolerance", "design.toml", *options, "-o", "t.json")
     assert (status, err) == (0, "") and "Yield:" in out and "all, by gradient" in out and "…" not in out
     assert max(map(len, out.split("- Yield")[0].splitlines())) <= 80
     numbers = json.loads((folder / "t.json").read_text())
@@ -327,10 +325,10 @@ def test_the_command(folder, monkeypatch, capsys):
         (("--min-strehl", "2"), "must be 0.001 to 1, got '2'"),
     ],
 )
-def test_wrong_input_is_one_line(folder, monkeypatch, capsys, arguments, message):
+def test_wrong_input_is_one_line(folder, run, arguments, message):
     (folder / "wrong.toml").write_text("possition_um = 1.0\n")
     (folder / "places.csv").write_text("x_mm,y_mm\n0,0\n")
-    status, _, err = run(monkeypatch, capsys, "tolerance", "design.toml", *arguments)
+    status, _, err = run("tolerance", "design.toml", *arguments)
     assert status == 2 and message in err and len(err.strip().splitlines()) == 1
     assert not (folder / "t.json").exists()
 

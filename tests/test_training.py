@@ -6,6 +6,7 @@ import optax
 import pytest
 from click.testing import CliRunner
 
+import gs_jax as gs
 from gs_jax.apps import training_data
 from gs_jax.apps.training import Recipe, init, read_checkpoint, slices_loss, train, write_checkpoint
 from gs_jax.apps.training_data import (
@@ -18,17 +19,12 @@ from gs_jax.apps.training_data import (
     simulate_stack,
     simulate_stacks,
 )
-from gs_jax.base.errors import InputError
 from gs_jax.cli.reconstruct import reconstruct_command
 from gs_jax.cli.train import train_command as command
-from gs_jax.design.design import read_design
-from gs_jax.detection.unet import UNet, read_weights, suppress
-from gs_jax.io.captures import write_capture
+from gs_jax.detection.unet import UNet, read_weights
 from gs_jax.io.files import side_file
-from gs_jax.io.volumes import read_volume
-from gs_jax.reconstruction.pipeline import reconstruct
 
-from .test_cli import DESIGN
+from .helpers import DESIGN
 
 
 def toy(offsets=(0,), batch=lambda rng: sample_paper_batch(rng, 16)) -> Recipe:
@@ -72,13 +68,13 @@ def test_an_interrupted_training_ends_as_if_it_were_not(tmp_path):
 def test_checkpoints_of_another_training_are_refused(tmp_path):
     path = tmp_path / "c"
     write_checkpoint(path, init(toy(), steps=8, seed=2))
-    with pytest.raises(InputError, match="seed of the training must be 3, as given, got 2"):
+    with pytest.raises(gs.InputError, match="seed of the training must be 3, as given, got 2"):
         read_checkpoint(path, toy(), steps=8, seed=3)
     for recipe, steps in ((toy(), 9), (toy((-1, 0, 1)), 8)):
-        with pytest.raises(InputError, match=f"checkpoint of this network and of {steps} steps"):
+        with pytest.raises(gs.InputError, match=f"checkpoint of this network and of {steps} steps"):
             read_checkpoint(path, recipe, steps=steps, seed=2)
     path.write_bytes(b"garbage")
-    with pytest.raises(InputError, match="not a whole and valid checkpoint"):
+    with pytest.raises(gs.InputError, match="not a whole and valid checkpoint"):
         read_checkpoint(path, toy(), steps=8, seed=2)
 
 
@@ -171,7 +167,7 @@ def test_stacks_are_kept(tmp_path):
         assert_equal(a, b)
     (second,) = folder.glob("5-1-*.npz")
     second.write_bytes(b"garbage")
-    with pytest.raises(InputError, match=second.name):
+    with pytest.raises(gs.InputError, match=second.name):
         simulate_stacks(folder, 2, 5, specs=TINY)
 
 
@@ -206,16 +202,16 @@ def test_trained_weights_reconstruct(toy_command, tmp_path, monkeypatch):
     assert (tmp_path / "w.npz.json").read_text().count(".") >= 3 and read_weights(tmp_path / "w.npz").widths == (4, 8)
     (tmp_path / "design.toml").write_text(DESIGN)
     capture = np.random.default_rng(0).integers(0, 99, (96, 80)).astype(np.uint16)
-    write_capture(tmp_path / "capture.tif", capture)
+    gs.write_capture(tmp_path / "capture.tif", capture)
     monkeypatch.chdir(tmp_path)
     options = ("--depths", "18:22:1", "--voxel-um", "50", "--suppress", "unet", "--weights", "w.npz", "-o", "v.tif")
     result = CliRunner().invoke(reconstruct_command, ["capture.tif", "design.toml", *options])
     assert result.exit_code == 0, result.output
-    volume, grid = read_volume("v.tif")
-    plain = reconstruct(capture, read_design("design.toml").imager(), grid)
-    expected = suppress(plain, read_weights("w.npz"))
+    volume, grid = gs.read_volume("v.tif")
+    plain = gs.reconstruct(capture, gs.read_design("design.toml").imager(), grid)
+    expected = gs.suppress(plain, read_weights("w.npz"))
     np.testing.assert_allclose(volume, expected, rtol=1e-5, atol=1e-5 * expected.max())
-    assert not np.allclose(volume, suppress(plain))
+    assert not np.allclose(volume, gs.suppress(plain))
 
 
 @pytest.mark.integration
@@ -250,5 +246,5 @@ def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, mon
 def test_wrong_arguments_write_nothing(toy_command, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     result = toy_command("--steps", 5, *arguments)
-    assert isinstance(result.exception, InputError) and message in str(result.exception)
+    assert isinstance(result.exception, gs.InputError) and message in str(result.exception)
     assert not list(tmp_path.iterdir())

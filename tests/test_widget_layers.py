@@ -11,10 +11,6 @@ from gs_jax.base.progress import CancellableProgress, Cancelled
 from gs_jax.io.volumes import read_volume
 from gs_jax.widget.layers import Newest, newest_captures, prepare_layers
 
-from .test_cli import folder, run
-
-__all__ = ["folder"]
-
 
 def test_the_newest_result_is_never_lost():
     """Put by one thread while another takes: what was put last is taken, and nothing twice or out of order."""
@@ -32,7 +28,7 @@ def test_the_newest_result_is_never_lost():
     assert found[-1] == last and found == sorted(set(found)) and newest.take() is None
 
 
-def test_a_capture_becomes_what_the_command_writes(folder, monkeypatch, capsys):
+def test_a_capture_becomes_what_the_command_writes(folder, run):
     progress = CancellableProgress(lambda: False)
     make = prepare_layers(folder / "design.toml", "18:22:1", 50.0, "backproject", "none", False, progress)
     result = make("seen", folder / "capture.tif")
@@ -40,7 +36,7 @@ def test_a_capture_becomes_what_the_command_writes(folder, monkeypatch, capsys):
     assert described["name"] == "seen, backproject"
     assert result.status == "5 x 39 x 33 voxels (z, y, x), 50 um laterally, 5 depths from 18 to 22 mm"
     words = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:1", "--voxel-um", "50", "-o", "v.tif")
-    assert run(monkeypatch, capsys, *words)[0] == 0
+    assert run(*words)[0] == 0
     # Float32 sums in another order.
     np.testing.assert_allclose(volume, read_volume(folder / "v.tif")[0], rtol=1e-5)
 

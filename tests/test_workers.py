@@ -7,23 +7,34 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import jax
 import numpy as np
 import psutil
 import pytest
 
+from gs_jax.apps.training import simulate_unrolled_examples
+from gs_jax.apps.training_data import SCENES, simulate_stacks
 from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
 from gs_jax.base.workers import Workers
-from gs_jax.io.ngff import JOURNAL
+from gs_jax.codesign.pareto import as_json, trade_off
+from gs_jax.codesign.search import run_study
+from gs_jax.codesign.study import Study
+from gs_jax.codesign.terms import TERMS, Term
+from gs_jax.design.start import geomscope
+from gs_jax.io.files import JOURNAL
 
-from .test_cli import folder, run
+from .test_pareto import STUDY
 from .test_recording import FRAMES, command, files, save, volumes
+from .test_training import TINY
+from .test_unrolled import TINY as TINY_UNROLLED
 
 pytestmark = pytest.mark.integration
 
-__all__ = ["folder"]
 
 distributed = pytest.importorskip("distributed", reason="needs pip install 'gs-jax[cluster]'")
 
@@ -111,7 +122,7 @@ def test_nothing_of_dask_is_imported_unless_it_is_asked_for(folder):
     assert done.returncode == 0, done.stderr
 
 
-def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
+def test_what_cannot_work_is_one_line(folder, run, monkeypatch):
     save("rec.tif")
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
@@ -125,12 +136,12 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
             (("--scheduler", "nowhere"), "--scheduler: no Dask scheduler is reachable at nowhere"),
             (("--scheduler", address, "--workers", "2"), "--workers must not be given together with --scheduler"),
         ):
-            status, _, err = run(monkeypatch, capsys, *command("rec.tif", *options))
+            status, _, err = run(*command("rec.tif", *options))
             assert status == 2 and words in err and err.count("\n") == 1
-    status, _, err = run(monkeypatch, capsys, *command("capture.tif", "--workers", "2"))
+    status, _, err = run(*command("capture.tif", "--workers", "2"))
     assert status == 2 and "--workers or --scheduler must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "distributed", None)
-    status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--workers", "2"))
+    status, _, err = run(*command("rec.tif", "--workers", "2"))
     assert (status, err) == (
         2,
         "gs-jax: distributed is not installed; it comes with pip install 'gs-jax[cluster]'.\n",
@@ -154,7 +165,7 @@ def numbers():
     return [json.loads(line)["frame"] for line in (Path("v.zarr") / JOURNAL).read_text().splitlines()[1:]]
 
 
-def test_a_recording_by_workers_one_of_which_is_killed(folder, monkeypatch, capsys):
+def test_a_recording_by_workers_one_of_which_is_killed(folder):
     """The same bytes as by one process, each frame once."""
     frames = np.random.default_rng(1).integers(101, 130, (60, 96, 80)).astype(np.uint16)
     frames[50, 40, 40] = 65535
@@ -175,7 +186,7 @@ def test_a_recording_by_workers_one_of_which_is_killed(folder, monkeypatch, caps
     assert by_two == by_one and points == (folder / "p.csv").read_bytes()
 
 
-def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, capsys):
+def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, run, monkeypatch):
     # Enough to be interrupted: a frame takes some milliseconds.
     count = 900
     frames = np.random.default_rng(2).integers(100, 3000, (count, 96, 80)).astype(np.uint16)
@@ -192,6 +203,108 @@ def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, ca
     monkeypatch.setattr("gs_jax.base.workers._ANSWER", 60)
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
         arguments = command("rec.tif", "--resume", "--scheduler", cluster.scheduler_address)
-        status, out, _ = run(monkeypatch, capsys, *arguments)
+        status, out, _ = run(*arguments)
     assert status == 0 and f"{count - len(before)} frames in" in out and sorted(numbers()) == list(range(count))
     assert volumes().any((1, 2, 3)).all()
+
+
+# Searches and training data by several workers are those of one process.
+
+
+START = geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4)
+SEVERAL = Study.model_validate(
+    STUDY
+    | {
+        "free": {"sensor_distance_mm": [2.0, 6.5], "aperture_diameter_mm": [0.1, 1.5]},
+        "terms": [{"name": "focus_offset", "at_most": 0.2}, {"name": "light_percent", "maximise": 0.001}],
+        "stages": [{"solver": "levenberg-marquardt"}, {"solver": "bfgs", "free": ["aperture_diameter_mm"]}],
+        "starts": 4,
+        "pareto": [],
+    }
+)
+
+
+def assert_same(found, wanted):
+    """Threads may share out a sum in another way: rounding, and what a search makes of it."""
+    assert found.design.model_dump().keys() == wanted.design.model_dump().keys()
+    for name in ("steps", "ends"):
+        for a, b in zip(getattr(found.log, name), getattr(wanted.log, name), strict=True):
+            assert {key: a[key] for key in ("stage", "start")} == {key: b[key] for key in ("stage", "start")}
+            assert a["cost"] == pytest.approx(b["cost"], rel=1e-9, abs=1e-12)
+    for a, b in zip(found.after, wanted.after, strict=True):
+        np.testing.assert_allclose(a[:2], b[:2], rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return run_study(START, SEVERAL)
+
+
+def test_starts_of_a_search(two, alone, tmp_path):
+    assert_same(run_study(START, SEVERAL, workers=two, checkpoint=tmp_path / "c"), alone)
+
+
+class Interrupted(Progress):
+    """After so many parts."""
+
+    left = 2
+
+    @contextmanager
+    def counter(self, description, total, *, quarter="", rate="", words=None):
+        def advance():
+            self.left -= 1
+            if not self.left:
+                raise KeyboardInterrupt
+
+        yield advance
+
+
+@pytest.mark.parametrize("first, then", [(True, False), (False, True), (True, True)])
+def test_an_interrupted_search_goes_on_whoever_runs_it(two, alone, tmp_path, first, then):
+    options = {"checkpoint": tmp_path / "c", "every": 0.0}
+    with pytest.raises(KeyboardInterrupt):
+        run_study(START, SEVERAL, progress=Interrupted(), workers=two if first else None, **options)
+    assert_same(run_study(START, SEVERAL, resume=True, workers=two if then else None, **options), alone)
+
+
+def test_points_of_a_front(two):
+    limits = {"pareto": [{"name": "depth_of_field_mm", "at_least": [3.0, 6.0, 9.0, 12.0]}]}
+    study, sizes = Study.model_validate(STUDY | limits), []
+    start = geomscope().replace(aperture_diameter_mm=1.4)
+    found = trade_off(start, study, workers=two, each=lambda front: sizes.append(len(front.points)))
+    np.testing.assert_allclose(found.values, trade_off(start, study).values, rtol=1e-9)
+    assert sizes == [1, 2, 3, 4] and len(as_json(found)["points"]) == 4
+
+
+def test_terms_of_ones_own(two, monkeypatch):
+    """A worker has not filled the table. One of ours that was replaced is the replacement there, too, but only then."""
+
+    def found(name, target):
+        only = {"free": {"sensor_distance_mm": [2.0, 6.5]}, "starts": 2, "stages": [{"solver": "levenberg-marquardt"}]}
+        study = Study.model_validate(STUDY | only | {"pareto": [], "terms": [{"name": name, "equal": target}]})
+        return run_study(geomscope(), study, workers=two).design.imaging.sensor_distance_mm
+
+    times = 3
+    own = Term("thrice the sensor's distance", lambda imager, at: times * imager.sensor_distance)
+    with monkeypatch.context() as patch:
+        for name in ("own_mm", "thickness_mm"):
+            patch.setitem(TERMS, name, own)
+            assert found(name, 15.0) == pytest.approx(5.0, abs=0.01)
+    # With the plate, 1 mm. Equal is within 0.1 %.
+    assert found("thickness_mm", 5.0) == pytest.approx(4.0, abs=0.01)
+
+
+def test_training_data(two, tmp_path):
+    made = simulate_stacks(tmp_path / "two", SCENES + 1, 5, specs=TINY, workers=two)
+    for a, b in zip(made, simulate_stacks(tmp_path / "one", SCENES + 1, 5, specs=TINY), strict=True):
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-3 * np.abs(y).max())
+
+
+def test_training_cases(two):
+    made, alone = (
+        simulate_unrolled_examples(SCENES + 1, 0, spec=TINY_UNROLLED, workers=workers) for workers in (two, None)
+    )
+    for a, b in zip(made, alone, strict=True):
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5 * np.abs(y).max(initial=1e-30))
