@@ -17,7 +17,7 @@ _TILE = 32
 # Half width of the Gaussian kernel in standard deviations.
 _TRUNCATE = 4
 # Smoothing before points are looked for, pixels: spots 2.5 pixels apart still have two maxima.
-_SMOOTHING = 0.7
+SMOOTHING = 0.7
 # Least noise, relative to the brightest spot: for images without noise, and for the steps of the camera's counts.
 _DYNAMIC_RANGE = 1000
 
@@ -36,7 +36,7 @@ def subtract_background(image: Image) -> DetectionImage:
     if np.iscomplexobj(image):
         raise input_error("image", "real", "complex numbers")
     check_finite("image", image)
-    light = gaussian_smooth(np.asarray(image), _SMOOTHING)
+    light = gaussian_smooth(np.asarray(image), SMOOTHING)
     background, noise = (interpolate_tiles(tiles, light.shape) for tiles in background_tiles(light))
     light -= background
     least = max(float(np.median(subsample(noise))), float(light.max()) / _DYNAMIC_RANGE)

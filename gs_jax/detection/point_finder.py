@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int
-from scipy.ndimage import map_coordinates
 
 from ..base.arrays import host_code, jit
 from ..base.errors import InputError, check_kind
@@ -20,9 +19,10 @@ from ..base.progress import Progress
 from ..base.typing import Image
 from ..microscope.geometry import Imager, check_beyond
 from ..microscope.grid import Grid
-from ..optics.psf_core import FIELDS, HALF_SIDE, core_width, ensquared_light, warn_if_blurred
+from ..optics.psf_core import warn_if_blurred
 from ..projection.backprojection import backproject
 from .background import DetectionImage, Pixels, filter_bands, subtract_background
+from .spot_fit import fit_points
 from .view_samples import (
     COARSE,
     THRESHOLD_SNR,
@@ -155,7 +155,8 @@ def find_points(
             lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
             new = _refine(new[lit], voxels, rest, lens_types)
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
-    points = np.column_stack([points, _intensity(points, samples, own.light, detection, lens_types)])
+    fit = fit_points(points, detection, lens_types)
+    points = np.column_stack([fit.positions, fit.intensities])
     points = points[_inside(points, grid, _step(voxels) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]
 
@@ -308,36 +309,3 @@ def _accept(
 
     own = separate_points(samples, image.light, take)
     return candidates[own.taken], samples.select(own.taken), own
-
-
-def _intensity(
-    points: Positions, samples: ViewSamples, own: np.ndarray, image: DetectionImage, lens_types: Sequence[LensType]
-) -> Float64[np.ndarray, " point"]:
-    """What the points emit, the median over the lenses.
-
-    The light in a square about each spot, times the point's own part of the middle, over the expected share of the
-    point's light in the square.
-    """
-    side = np.arange(-HALF_SIDE, HALF_SIDE + 1)
-    middle = np.floor(samples.pixels + 0.5).astype(int)
-    row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(image.light.shape))
-    total = image.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
-    expected = _expected_share(points, samples, lens_types[0].imager)
-    for number, lens_type in enumerate(lens_types[1:], 1):
-        of_type = _expected_share(points, samples, lens_type.imager)
-        expected = np.where(samples.lens_type == number, of_type, expected)
-    use = samples.seen & (samples.light > 0) & (expected > 0)
-    ratio = np.where(use, total * own / np.where(use, samples.light * expected, 1), 0)
-    return np.array([np.median(views[which]) if which.any() else 0.0 for views, which in zip(ratio, use, strict=True)])
-
-
-def _expected_share(points: Positions, samples: ViewSamples, imager: Imager) -> Float64[np.ndarray, "point lens"]:
-    """Share of a point's light in the square about the core of each view, by exact rays."""
-    if not len(points):
-        return np.zeros_like(samples.light)
-    depths = np.linspace(points[:, 2].min(), points[:, 2].max(), _DEPTHS if np.ptp(points[:, 2]) > 0 else 1)
-    fields = np.linspace(0, imager.field_radius, FIELDS)
-    shares = ensquared_light(imager, depths, fields, core_width(imager))
-    index = np.interp(points[:, 2], depths, np.arange(len(depths)))[:, None]
-    at = np.stack(np.broadcast_arrays(index, samples.field / fields[1]))
-    return map_coordinates(shares, at.reshape(2, -1), order=1, mode="nearest").reshape(samples.field.shape)
