@@ -155,7 +155,7 @@ def find_points(
             lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
             new = _refine(new[lit], voxels, rest, lens_types)
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
-    fit = fit_points(points, detection, lens_types)
+    fit = fit_points(points, view_quantile(own.light, samples.seen, 0.5), detection, lens_types)
     points = np.column_stack([fit.positions, fit.intensities])
     points = points[_inside(points, grid, _step(voxels) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 
@@ -40,6 +40,8 @@ _STEPS, _FACTOR, _FARTHEST_SHIFT, _TABLE_ERROR = 2, 3.0, 3.0, 0.05
 _CAUCHY, _RENEWALS = 2.0, 8
 # Fewest views of a fit, and views that are fitted at once.
 _MIN_VIEWS, _AT_ONCE = 3, 4096
+# Movement of a point for derivatives, mm.
+_MOVE = 1e-3
 
 
 class SpotTables(NamedTuple):
@@ -53,8 +55,37 @@ class SpotTables(NamedTuple):
     depths: Float64[np.ndarray, " depth"]
     step: float
     middle: Float64[np.ndarray, "depth field"]
-    spots: Float[np.ndarray, "depth field derivative along across"]
+    spots: Float32[np.ndarray, "depth field derivative along across"]
     reach: float
+
+    def height_at(self, depth) -> Float64[np.ndarray, " point"]:
+        """Mean light in the middle pixel of the spots of points at these depths, near the axis."""
+        middle = self.spots.shape[-1] // 2
+        return np.interp(depth, self.depths, self.spots[:, : _FIELDS + 1, 0, middle, middle].mean(1))
+
+    def _between(self, depth, field, part):
+        """Values of a table at depths and fields, bilinear between their neighbours."""
+        at = np.interp(depth, self.depths, np.arange(len(self.depths))), field / self.step
+        low = [np.minimum(x.astype(int), n - 2) for x, n in zip(at, part.shape, strict=False)]
+        high = [
+            (x - lower).reshape(-1, *[1] * (part.ndim - 2)).astype(part.dtype) for x, lower in zip(at, low, strict=True)
+        ]
+        return sum(
+            (1 - high[0] if i == 0 else high[0]) * (1 - high[1] if j == 0 else high[1]) * part[low[0] + i, low[1] + j]
+            for i in (0, 1)
+            for j in (0, 1)
+        )
+
+    def middle_at(self, depth, field) -> Float64[np.ndarray, " view"]:
+        """Middle of the core of each view."""
+        return self._between(depth, field, self.middle)
+
+    def spots_at(self, depth, field, along, across) -> Float32[np.ndarray, "3 view pixel"]:
+        """Spot of each view, and its derivatives, in pixels at these distances from its middle."""
+        spots = self._between(depth, field, self.spots)
+        view = np.broadcast_to(np.arange(len(spots))[:, None], along.shape)
+        place = np.stack([view, *(_BINS * x + spots.shape[-1] // 2 for x in (along, across))])
+        return np.stack([map_coordinates(spots[:, k], place, np.float32, order=1, mode="nearest") for k in range(3)])
 
 
 class Fit(NamedTuple):
@@ -102,93 +133,85 @@ def _spot(along, across, light, edges):
 
 
 def fit_points(
-    points: Float[np.ndarray, "point 3"], image: DetectionImage, lens_types: Sequence[LensType]
+    points: Float[np.ndarray, "point 3"],
+    brightness: Float[np.ndarray, " point"],
+    image: DetectionImage,
+    lens_types: Sequence[LensType],
 ) -> Fit:
     """Move points to where their spots are, from at most three pixels beside, and measure their light.
 
-    A point that fewer than three lenses show keeps its position.
+    The spots of all other points are subtracted from those of a point. `brightness` is about that of the middle of a
+    point's spots. A point that fewer than three lenses show keeps its position.
     """
-    positions, intensities = np.array(points, np.float64), np.zeros(len(points))
-    if not len(points):
-        return Fit(positions, intensities)
+    positions = np.array(points, np.float64)
+    if not len(positions):
+        return Fit(positions, np.zeros(0))
+    tables = [spot_tables(one.imager, float(one.depths[0]), float(one.depths[-1])) for one in lens_types]
+    intensities = np.divide(brightness, tables[0].height_at(positions[:, 2]))
     for _ in range(_STEPS):
-        parts = [_fit_views(positions, image, lens_type) for lens_type in lens_types]
-        views = _Views(*(np.concatenate(part, 1) for part in zip(*parts, strict=True)))
-        move, intensities = _combine(views)
+        views = [_find_views(positions, *pair, image.light.shape) for pair in zip(lens_types, tables, strict=True)]
+        rest = image.light.copy()
+        for one in views:
+            np.subtract.at(rest, one.pixels, intensities[one.point, None].astype(np.float32) * one.spot[0])
+        fits = [_fit_views(rest, one, intensities) for one in views]
+        move, intensities = _combine(len(positions), *map(np.concatenate, zip(*fits, strict=True)))
         positions += move
     return Fit(positions, intensities)
 
 
 class _Views(NamedTuple):
-    """Fits of the views of each point; `light` is NaN where there is none.
+    """Views of points: where, and what is expected there.
 
-    `field`: distance of the point from the lens's axis, in field radii. `shift`: of a spot from its place, along and across the field, pixels. `variance`: of these. `slope`: their
-    derivatives by the point's position, per mm.
+    `point`: its number. `is_inner`: whether the lens is within the field radius. `slope`: derivatives of the spot's
+    place along and across the field by the point's position, pixels per mm. `pixels`: row and column of each pixel of
+    the window. `spot`: light of a point of intensity 1 in them, and its derivatives along and across the field.
     """
 
-    light: Float64[np.ndarray, "point lens"]
-    field: Float64[np.ndarray, "point lens"]
-    shift: Float64[np.ndarray, "point lens 2"]
-    variance: Float64[np.ndarray, "point lens 2"]
-    slope: Float64[np.ndarray, "point lens 2 3"]
+    point: Int[np.ndarray, " view"]
+    is_inner: Bool[np.ndarray, " view"]
+    slope: Float64[np.ndarray, "view 2 3"]
+    pixels: tuple[Int[np.ndarray, "view pixel"], Int[np.ndarray, "view pixel"]]
+    spot: Float32[np.ndarray, "3 view pixel"]
 
 
-def _fit_views(points, image: DetectionImage, lens_type: LensType) -> _Views:
-    """Fit the spots of all points under the lenses of one type."""
+def _find_views(points, lens_type: LensType, tables: SpotTables, shape: tuple[int, int]) -> _Views:
+    """Views of all points by the lenses of one type whose windows are on the image."""
     imager, pitch = to_numpy(lens_type.imager), lens_type.imager.sensor.pixel_pitch
-    tables = spot_tables(lens_type.imager, lens_type.depths[0], lens_type.depths[-1])
     from_axis, tree = points[:, :2] - imager.axis_offset(points[:, 2]), KDTree(imager.centers)
-    most = max(tree.query_ball_point(from_axis, tables.reach, return_length=True))
-    distance, lens = tree.query(from_axis, k=max(most, 2), distance_upper_bound=tables.reach)
-    seen = np.isfinite(distance) & lens_type.sees(points[:, 2])[:, None]
-    light, both = np.full(seen.shape, np.nan), (*seen.shape, 2)
-    field = distance / float(imager.field_radius)
-    views = _Views(light, field, np.zeros(both), np.ones(both), np.zeros((*both, 3)))
-    point, column = np.nonzero(seen)
+    lenses = tree.query_ball_point(from_axis, tables.reach)
+    point = np.repeat(np.arange(len(points)), [len(near) for near in lenses])
+    lens = np.concatenate(lenses).astype(int)
+    sharp = lens_type.sees(points[:, 2])[point]
+    point, lens = point[sharp], lens[sharp]
+    at, views = points[point], imager.views(points[point], lens)
+    field = np.hypot(*views.offset.T)
+    along = views.offset / np.maximum(field, 1e-9)[:, None]
+    axes = np.stack([along, along[:, ::-1] * [-1, 1]], 1)
+    moved = [(imager.views(at + move, lens).spot - views.spot) / _MOVE for move in _MOVE * np.eye(3)]
+    slope = np.einsum("vij,kvj->vik", axes, np.stack(moved)) / pitch
+    place, middle = np.asarray(imager.sensor.to_pixels(views.spot)), tables.middle_at(at[:, 2], field)
+    core = np.floor(place + middle[:, None] * axes[:, 0, ::-1] + 0.5).astype(int)
+    use = ((core >= _HALF) & (core < np.array(shape) - _HALF)).all(-1)
+    point, field, slope, axes, place, middle, core, depth = (
+        part[use] for part in (point, field, slope, axes, place, middle, core, at[:, 2])
+    )
+    side = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].reshape(2, 1, -1)
+    row, column = core.T[:, :, None] + side
+    down, right = row - place[:, :1], column - place[:, 1:]
+    along = axes[:, 0, :1] * right + axes[:, 0, 1:] * down - middle[:, None]
+    across = axes[:, 1, :1] * right + axes[:, 1, 1:] * down
+    spot = np.empty((3, *row.shape), np.float32)
     for first in range(0, len(point), _AT_ONCE):
-        some = point[first : first + _AT_ONCE], column[first : first + _AT_ONCE]
-        at, center = points[some[0]], lens[some]
-        offset = imager.views(at, center).offset
-        from_lens = np.hypot(*offset.T)
-        along = offset / np.maximum(from_lens, 1e-9)[:, None]
-        axes = np.stack([along, along[:, ::-1] * [-1, 1]], 1)
-        spot = imager.views(at, center).spot
-        moved = [(imager.views(at + step, center).spot - spot) / (pitch * 1e-3) for step in 1e-3 * np.eye(3)]
-        pixels = np.asarray(imager.sensor.to_pixels(spot))
-        light, shift, variance = _fit_spots(pixels, axes, at[:, 2], from_lens, tables, image.light)
-        slope = np.einsum("vij,kvj->vik", axes, np.stack(moved))
-        for part, values in zip((views.light, *views[2:]), (light, shift, variance, slope), strict=True):
-            part[some] = values
-    return views
+        some = slice(first, first + _AT_ONCE)
+        spot[:, some] = tables.spots_at(depth[some], field[some], along[some], across[some])
+    return _Views(point, field <= float(imager.field_radius), slope, (row, column), spot)
 
 
-def _fit_spots(pixels, axes, depth, field, tables: SpotTables, image):
-    """Light, shift and its variance of each view, by linear least squares in its window."""
-    # Bilinear between the tables of neighbouring depths and fields.
-    at = np.interp(depth, tables.depths, np.arange(len(tables.depths))), field / tables.step
-    low = [np.minimum(x.astype(int), n - 2) for x, n in zip(at, tables.middle.shape, strict=True)]
-    part = [x - lower for x, lower in zip(at, low, strict=True)]
-    shares = [(i, j, abs(1 - i - part[0]) * abs(1 - j - part[1])) for i in (0, 1) for j in (0, 1)]
-    middle = sum(share * tables.middle[low[0] + i, low[1] + j] for i, j, share in shares)
-    spots = sum(
-        share[:, None, None, None].astype(np.float32) * tables.spots[low[0] + i, low[1] + j] for i, j, share in shares
-    )
-    side = np.arange(-_HALF, _HALF + 1)
-    core = np.floor(pixels + middle[:, None] * axes[:, 0, ::-1] + 0.5).astype(int)
-    inside = ((core >= _HALF) & (core < np.array(image.shape) - _HALF)).all(-1)
-    core = np.where(inside[:, None], core, _HALF)
-    row, column = core[:, 0, None, None] + side[:, None], core[:, 1, None, None] + side
-    data = image[row, column].reshape(len(core), -1).astype(np.float64)
-    down, right = row - pixels[:, 0, None, None], column - pixels[:, 1, None, None]
-    along, across = (
-        _BINS * (axes[:, k, 0, None, None] * right + axes[:, k, 1, None, None] * down - start) + spots.shape[-1] // 2
-        for k, start in enumerate((middle[:, None, None], 0.0))
-    )
-    view = np.broadcast_to(np.arange(len(core))[:, None, None], along.shape)
-    place = np.stack([view, along, across]).reshape(3, -1)
-    shape, d_along, d_across = (
-        map_coordinates(spots[:, k], place, np.float64, order=1, mode="nearest").reshape(data.shape) for k in range(3)
-    )
+def _fit_views(rest, views: _Views, intensities):
+    """Light, shift along and across the field, and its variance, of each view by linear least squares."""
+    shape, d_along, d_across = views.spot.astype(np.float64)
+    expected = intensities[views.point]
+    data = rest[views.pixels] + expected[:, None] * shape
     # A spot that is moved by s is the spot less s times its derivative.
     columns = np.stack([shape, np.ones_like(shape), -d_along, -d_across], -1)
     scale = np.sqrt((columns**2).sum(1)) + 1e-30
@@ -197,28 +220,47 @@ def _fit_spots(pixels, axes, depth, field, tables: SpotTables, image):
     solution = np.einsum("vij,vpj,vp->vi", inverse, columns, data)
     noise = ((data - np.einsum("vpi,vi->vp", columns, solution)) ** 2).mean(1)
     solution /= scale
-    light = np.where(inside & (solution[:, 0] > 0), solution[:, 0], np.nan)
+    light = np.where(solution[:, 0] > 0, solution[:, 0], np.nan)
     variance = noise[:, None] * np.diagonal(inverse, axis1=1, axis2=2)[:, 2:] / scale[:, 2:] ** 2
-    return light, solution[:, 2:] / light[:, None], variance / light[:, None] ** 2
+    return (
+        views.point,
+        views.is_inner,
+        views.slope,
+        light,
+        solution[:, 2:] / light[:, None],
+        variance / light[:, None] ** 2,
+    )
 
 
-def _combine(views: _Views) -> tuple[Float64[np.ndarray, "point 3"], Float64[np.ndarray, " point"]]:
-    """Movement and intensity of each point from all of its views."""
-    light, inner = views.light, np.isfinite(views.light) & (views.field <= 1)
-    # Beyond the field radius a field stop may take the light.
-    bright = np.array([np.median(row[use]) if use.any() else 0.0 for row, use in zip(light, inner, strict=True)])
-    with np.errstate(invalid="ignore"):
-        good = (light > bright[:, None] / _FACTOR) & (light < bright[:, None] * _FACTOR)
-        good &= (np.abs(views.shift) < _FARTHEST_SHIFT).all(-1)
-    good = np.repeat(good, 2, 1)
-    shift = np.where(good, views.shift.reshape(good.shape), 0)
-    accuracy = np.where(good, 1 / np.sqrt(views.variance.reshape(good.shape) + _TABLE_ERROR**2), 0)
-    slope = views.slope.reshape(*good.shape, 3)
-    weight, move = accuracy**2, np.zeros((len(good), 3))
+def _combine(count, point, is_inner, slope, light, shift, variance):
+    """Movement and intensity of each of `count` points from all of their views."""
+    move, intensity = np.zeros((count, 3)), np.zeros(count)
+    order = np.argsort(point, kind="stable")
+    for number, mine in zip(*_split(point[order], order), strict=True):
+        lit = mine[np.isfinite(light[mine])]
+        # Beyond the field radius a field stop may take the light.
+        inner = light[lit[is_inner[lit]]]
+        intensity[number] = np.median(inner) if inner.size else 0.0
+        ratio = light[lit] / max(intensity[number], 1e-30)
+        good = lit[(ratio > 1 / _FACTOR) & (ratio < _FACTOR) & (np.abs(shift[lit]) < _FARTHEST_SHIFT).all(-1)]
+        if len(good) >= _MIN_VIEWS:
+            accuracy = 1 / np.sqrt(variance[good].ravel() + _TABLE_ERROR**2)
+            move[number] = _robust_solution(slope[good].reshape(-1, 3), shift[good].ravel(), accuracy)
+    return move, intensity
+
+
+def _split(point, order):
+    numbers, first = np.unique(point, return_index=True)
+    return numbers, np.split(order, first[1:])
+
+
+def _robust_solution(matrix, values, accuracy):
+    """Least squares whose weights fall with the error, by Cauchy's function."""
+    weight = accuracy
+    solution = np.zeros(3)
     for _ in range(_RENEWALS):
-        normal = np.einsum("pv,pvi,pvj->pij", weight, slope, slope) + 1e-9 * np.eye(3)
-        move = np.linalg.solve(normal, np.einsum("pv,pvi,pv->pi", weight, slope, shift)[..., None])[..., 0]
-        error = np.abs(shift - np.einsum("pvi,pi->pv", slope, move)) * accuracy
-        spread = 1.4826 * np.array([np.median(e[g]) if g.any() else 1.0 for e, g in zip(error, good, strict=True)])
-        weight = accuracy**2 / (1 + (error / (_CAUCHY * np.maximum(spread, 1e-9))[:, None]) ** 2)
-    return np.where(good.sum(1)[:, None] >= 2 * _MIN_VIEWS, move, 0), bright
+        solution = np.linalg.lstsq(weight[:, None] * matrix, weight * values)[0]
+        error = np.abs(values - matrix @ solution) * accuracy
+        spread = max(1.4826 * float(np.median(error)), 1e-9)
+        weight = accuracy / np.sqrt(1 + (error / (_CAUCHY * spread)) ** 2)
+    return solution
