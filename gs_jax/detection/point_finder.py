@@ -50,13 +50,11 @@ _MIN_LENSES = 3
 _OWN_LIGHT = 0.5
 # Expected number of false alarms in a capture: one in ten captures.
 _FALSE_ALARMS = 0.1
-# A candidate's neighbourhood is searched so often, each time half as wide: to 1/128 of a voxel, 0.3 um.
-_REFINEMENTS = 7
+# A candidate's neighbourhood is searched so often, each time half as wide: to 1/16 of a voxel, before spots are fitted.
+_REFINEMENTS = 4
 # Planes that are back-projected at once. Planes, and voxels along an axis less one, are rounded up to multiples of
 # these, so that other depths and magnifications find the program.
 _PLANES, _FEW_PLANES, _FEW_VOXELS = 32, 8, 16
-# Depths at which the light in a core is traced.
-_DEPTHS = 5
 # Depths at which cores are traced, and margin beyond the grid, relative to the depth.
 _TRACED, _MARGIN = 9, 0.05
 # Consequence, in warnings, where spots are not sharp.
@@ -80,6 +78,8 @@ def find_points(
        would light anywhere in the volume (`log_false_alarms`), and mostly not by points before it. The light of each
        point is subtracted from the views of the others, by the shape of its own spots.
     4. The search is repeated on what the image holds beside the points, for those near brighter ones.
+    5. The shapes of all spots, by exact rays, are fitted to the pixels, also under the lenses beyond the field radius
+       that are bright and sharp enough: they place the point and measure its light (`gs_jax.detection.spot_fit`).
 
     Nothing is random. Thresholds are multiples of the image's own noise, which is taken to be at least a thousandth of
     the brightest spot: points whose spots have less than a two-hundredth of its height are not found. Points are
@@ -101,7 +101,7 @@ def find_points(
     -------
     ndarray
         `(point, 4)`, brightest first. The intensity is all that the point emits, in every direction, in the image's
-        unit: the light in the cores of its spots over the share that exact rays bring there.
+        unit: the height of its spots over that of exact rays.
 
     Raises
     ------

@@ -24,7 +24,7 @@ from .background import SMOOTHING, DetectionImage
 from .view_samples import LensType
 
 # Field points in a field radius, rays of each, and depths.
-_FIELDS, _RAYS, _DEPTHS = 6, 8192, 7
+_FIELDS, _RAYS, _DEPTHS = 6, 4096, 6
 # Half the side of the window about a spot's middle that is fitted, pixels, and of its table, which is turned and moved.
 _HALF, _TABLE = 5, 11
 # Bins of a table in a pixel, and how far from the chief ray the middle may be, pixels.
