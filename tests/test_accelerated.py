@@ -1,9 +1,12 @@
-"""The form for GPUs and TPUs, run on a CPU: the same numbers as the other form's, and programs without conditionals."""
+"""The forms for GPUs and TPUs, run on a CPU: the same numbers as the CPU's, and programs without conditionals."""
 
 import re
+import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import equinox as eqx
 import jax
@@ -16,7 +19,7 @@ from jax.test_util import check_grads
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward, psf_model
 from gs_jax.linear.linear_map import compiled_for_cpu
 from gs_jax.optics.field_varying import field_varying_psf
-from gs_jax.projection import tiles
+from gs_jax.projection import cuda, tiles
 from gs_jax.projection.bilinear import image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.rays import Envelope, RingLight, Shapes
 from gs_jax.projection.stray_light import Windows, interpolate_windows
@@ -41,9 +44,9 @@ def lowered(form, function: Callable, *arguments):
         return jax.jit(lambda *arguments: function(*arguments)).lower(*arguments)
 
 
-def same(function: Callable, *arguments, tolerance=1e-12) -> Any:
+def same(function: Callable, *arguments, tolerance=1e-12, form="accelerated") -> Any:
     """The results, for which both forms must agree relative to the largest number of each array."""
-    programs = [lowered(form, function, *arguments) for form in ("accelerated", "xla")]
+    programs = [lowered(form, function, *arguments) for form in (form, "xla")]
     assert programs[0].as_text() != programs[1].as_text()
     results, expected = (program.compile()(*arguments) for program in programs)
     for a, b in zip(jax.tree.leaves(results), jax.tree.leaves(expected), strict=True):
@@ -76,26 +79,103 @@ def both_ways(shapes, rays, image, volume):
 
 
 further = partial(pytest.param, marks=pytest.mark.integration)
+TILTED = (ENVELOPE, (40, 66), 0.03, {"tilt": (0.05, -0.03)})
+FEW = (ENVELOPE, (5, 3), 0.02, {"lenses": 1, "pixels": (13, 40)})
+CASES = [
+    TILTED,
+    (RingLight(0.0, 0.4), (40, 33), 0.006, {"lenses": 40}),  # two to three rays on a pixel
+    further(RING, (9, 8), 0.21, {}),  # 11 to 15 pixels apart
+    further(ENVELOPE, (40, 33), 0.001, {"nearest": True}),  # up to 18 on a pixel
+    further(*FEW),
+    further(ENVELOPE, (21, 17), 0.05, {"dtype": jnp.float32}),
+]
 
 
-@pytest.mark.parametrize(
-    ("weight", "voxels", "pitch", "options"),
-    [
-        (ENVELOPE, (40, 66), 0.03, {"tilt": (0.05, -0.03)}),
-        (RingLight(0.0, 0.4), (40, 33), 0.006, {"lenses": 40}),  # two to three rays on a pixel
-        further(RING, (9, 8), 0.21, {}),  # 11 to 15 pixels apart
-        further(ENVELOPE, (40, 33), 0.001, {"nearest": True}),  # up to 18 on a pixel
-        further(ENVELOPE, (5, 3), 0.02, {"lenses": 1, "pixels": (13, 40)}),
-        further(ENVELOPE, (21, 17), 0.05, {"dtype": jnp.float32}),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("weight", "voxels", "pitch", "options"), CASES, ids=str)
 def test_both_forms_give_the_same(weight, voxels, pitch, options, monkeypatch):
     monkeypatch.setattr(tiles, "_BAND", 2 * 3 * 32**2)  # several bands of the image
     shapes, *arrays = problem(weight, voxels, pitch, **options)
     single = options.get("dtype") == jnp.float32
     volume, *_, image = same(partial(both_ways, shapes), *arrays, tolerance=2e-6 if single else 1e-12)
     assert volume.any() and image.any()
+
+
+@pytest.mark.parametrize(("weight", "voxels", "pitch", "options"), [TILTED, further(*FEW)], ids=str)
+def test_a_scatter_add_gives_the_same(weight, voxels, pitch, options, monkeypatch):
+    monkeypatch.setattr(cuda, "SCATTERS", True)
+    shapes, rays, _, volume = problem(weight, voxels, pitch, **options)
+    assert same(partial(volume_to_image, shapes), rays, volume, form="cuda").any()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(("weight", "voxels", "pitch", "options"), [getattr(c, "values", c) for c in CASES], ids=str)
+def test_kernels_of_warp_give_the_same(weight, voxels, pitch, options):
+    """Compiled for the processor."""
+    pytest.importorskip("warp")
+    shapes, *arrays = problem(weight, voxels, pitch, **options | {"dtype": jnp.float32})
+    volume, *_, image = same(partial(both_ways, shapes), *arrays, tolerance=2e-6, form="cuda")
+    assert volume.any() and image.any()
+
+
+@pytest.mark.integration
+def test_kernels_of_warp_have_derivatives_and_batches():
+    pytest.importorskip("warp")
+    shapes, rays, image, volume = problem(ENVELOPE, (21, 17), 0.05, dtype=jnp.float32)
+
+    def derivatives(rays, image, volume):
+        back = partial(image_to_volume, shapes, rays)
+        square = lambda image: jnp.vdot(back(image), back(image)) + jnp.vdot(back(image), volume)
+        slope, change = jax.jvp(jax.grad(square), (image,), (jnp.sin(image),))
+        batch = jax.vmap(back)((jnp.stack([image, 0.5 * image]) * 65535).astype(jnp.uint16))
+        return slope, change, batch
+
+    same(derivatives, rays, image, volume, tolerance=2e-6, form="cuda")
+
+
+@pytest.mark.integration
+def test_kernels_of_warp_in_the_full_model():
+    pytest.importorskip("warp")
+    imager, grid = test_full.imager(jnp.float32), test_full.grid(jnp.float32)
+    optics = field_varying_psf(imager, grid.depths)
+    volume, image = (
+        np.random.default_rng(0).random(shape, np.float32) for shape in (grid.volume_shape, imager.sensor.shape)
+    )
+
+    def both(volume, image):
+        made, transpose = jax.vjp(lambda volume: forward(volume, imager, grid, optics), volume)
+        return made, transpose(image)
+
+    same(both, volume, image, tolerance=1e-5, form="cuda")
+
+
+@pytest.mark.parametrize(
+    ("has_warp", "scatters", "dtype", "forms"),
+    [
+        (True, True, np.float32, ("warp", "warp")),
+        (True, True, np.float64, ("gather", "add_to_pixels")),
+        (False, True, np.float32, ("gather", "add_to_pixels")),
+        (False, False, np.float32, ("gather", "scatter")),
+    ],
+)
+def test_which_form_gpus_run(has_warp, scatters, dtype, forms, monkeypatch):
+    named = lambda **names: SimpleNamespace(**{key: lambda *_, name=name: name for key, name in names.items()})
+    monkeypatch.setattr(cuda, "_load", lambda: named(gather="warp", scatter="warp") if has_warp else None)
+    monkeypatch.setattr(cuda, "tiles", named(gather="gather", scatter="scatter", add_to_pixels="add_to_pixels"))
+    monkeypatch.setattr(cuda, "SCATTERS", scatters)
+    rays = SimpleNamespace(parameters=np.zeros((2, 1), dtype))
+    assert (cuda.gather((), rays, None), cuda.scatter((), rays, None)) == forms
+
+
+def test_a_warp_that_does_not_fit_gives_one_warning(tmp_path, monkeypatch):
+    (tmp_path / "warp.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("warp", "gs_jax.projection.warp_kernels"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.delattr(sys.modules["gs_jax.projection"], "warp_kernels", raising=False)
+    load = cache(cuda._load.__wrapped__)
+    with pytest.warns(RuntimeWarning, match="XLA is used instead, which is slower: AttributeError") as warned:
+        assert load() is load() is None
+    assert len(warned) == 1
 
 
 @pytest.mark.parametrize("weight", [ENVELOPE, further(RING)], ids=str)
@@ -156,21 +236,27 @@ def test_the_forward_model_is_the_same(fidelity, tables):
 def exported(function: Callable, *arguments) -> tuple[int, int]:
     """Loops of the StableHLO program for NVIDIA's GPUs, and those whose number of steps is traced.
 
-    Conditions would go to the host. Some versions of JAX compile a scatter-add to loops that wait for each other.
+    Conditions would go to the host.
     """
-    text = export.export(jax.jit(function), platforms=["cuda"])(*arguments).mlir_module()
-    for operation in ("stablehlo.case", "stablehlo.if", "stablehlo.scatter"):
+    with patch.object(cuda, "_load", lambda: None):
+        # A new function, which is lowered anew.
+        program = jax.jit(lambda *arguments: function(*arguments))
+        text = export.export(program, platforms=["cuda"])(*arguments).mlir_module()
+    for operation in ("stablehlo.case", "stablehlo.if", *["stablehlo.scatter"] * (not cuda.SCATTERS)):
         assert operation not in text
     traced = re.findall(r"cond {[^}]*stablehlo.compare +LT, %iterArg\w*, %iterArg", text)
     return text.count("stablehlo.while"), len(traced)
 
 
-def test_projections_for_cuda_have_at_most_one_loop_with_a_traced_number_of_steps():
+@pytest.mark.parametrize(("scatters", "adjoint"), [(False, (3, 1)), (True, (2, 1))])
+def test_projections_for_cuda_have_at_most_one_loop_with_a_traced_number_of_steps(scatters, adjoint, monkeypatch):
+    monkeypatch.setattr(cuda, "SCATTERS", scatters)
     imager, grid = scene(jnp.float32)
     image, volume = (np.zeros(shape, np.float32) for shape in (imager.sensor.shape, grid.volume_shape))
-    # The others are over groups of depths, bands of the image and groups of lenses.
-    assert exported(backproject, image, imager, grid) == (2, 1)
-    assert exported(backproject_adjoint, volume, imager, grid) == (3, 1)
+    # A form for CPUs changes nothing. Other loops are over groups of depths, bands of the image and groups of lenses.
+    with compiled_for_cpu("xla"):
+        assert exported(backproject, image, imager, grid) == (2, 1)
+    assert exported(backproject_adjoint, volume, imager, grid) == adjoint
     slope = lambda v: jnp.vdot(backproject(image, eqx.tree_at(lambda i: i.sensor_distance, imager, v), grid), volume)
     assert exported(jax.grad(slope), imager.sensor_distance) == (3, 0)
 
@@ -181,6 +267,8 @@ def test_the_full_model_for_cuda_has_one_such_loop_for_each_size_of_pixels():
     imager, grid = test_full.imager(jnp.float32), test_full.grid(jnp.float32)
     optics = field_varying_psf(imager, grid.depths)
     image, volume = (jnp.zeros(shape, jnp.float32) for shape in (imager.sensor.shape, grid.volume_shape))
-    assert exported(forward, volume, imager, grid, optics) == (9, 2)
+    # Images are added to in bands, or at once by scatter-adds.
+    loops = (7, 2) if cuda.SCATTERS else (9, 2)
+    assert exported(forward, volume, imager, grid, optics) == loops
     adjoint = lambda image, *model: jax.linear_transpose(lambda volume: forward(volume, *model), volume)(image)
     assert exported(adjoint, image, imager, grid, optics) == (9, 2)

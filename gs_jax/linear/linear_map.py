@@ -1,12 +1,14 @@
 """Linear maps with hand-written transposes and derivatives: a JAX primitive with a form for each platform.
 
-CPUs run compiled kernels where there are any, GPUs and TPUs a form without loops over lenses.
+CPUs run compiled kernels where there are any, GPUs and TPUs a form without loops over lenses. NVIDIA's GPUs may have a
+form of their own.
 """
 
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -46,13 +48,16 @@ class LinearMap:
     accelerated
         Functions that replace `function` and `transpose` on GPUs and TPUs, but not in second derivatives. None: the
         same as on CPUs.
+    cuda
+        Functions that replace those of `accelerated` on NVIDIA's GPUs. None: the same.
     """
 
     function: Callable
     transpose: Callable
     constants_vjp: Callable | None = None
     kernels: tuple[Callable | None, ...] = (None, None)
-    accelerated: tuple[Callable | None, Callable | None] = (None, None)
+    accelerated: tuple[Callable | None, ...] = (None, None)
+    cuda: tuple[Callable | None, ...] = (None, None)
 
     def __call__(self, static: Hashable, constants: PyTree, x: PyTree) -> PyTree:
         flat_constants, constants_tree = tree.flatten(constants)
@@ -67,8 +72,8 @@ class LinearMap:
         vjp = self.constants_vjp
         # A transpose of a transpose equals the map, whose compiled programs serve it.
         vjp = vjp.constants_vjp if isinstance(vjp, _Swapped) else vjp and _Swapped(vjp)
-        (kernel, of_transpose), (form, of_transposed) = self.kernels, self.accelerated
-        return LinearMap(self.transpose, self.function, vjp, (of_transpose, kernel), (of_transposed, form))
+        swapped = (forms[::-1] for forms in (self.kernels, self.accelerated, self.cuda))
+        return LinearMap(self.transpose, self.function, vjp, *swapped)
 
 
 @dataclass(frozen=True)
@@ -180,15 +185,13 @@ def _batch(arrays, axes, *, call):
     return y, [0] * len(y)
 
 
-def _run_on_accelerator(*arrays, call):
-    return call(*arrays, function=call.map.accelerated[0])
-
-
-def _run_on_cpu(*arrays, call):
-    """Uses a compiled kernel in float32; float64 is for comparisons."""
-    if _form.get() == "accelerated":
-        return _run_on_accelerator(*arrays, call=call)
-    load = None if _form.get() == "xla" or jax.default_backend() != "cpu" else call.map.kernels[0]
+def _run_on(platform, *arrays, call):
+    """On a CPU uses a compiled kernel in float32; float64 is for comparisons."""
+    platform = _form.get() or platform if platform == "cpu" else platform
+    if platform in ("cuda", "accelerated"):
+        function = call.map.cuda[0] if platform == "cuda" else None
+        return call(*arrays, function=function or call.map.accelerated[0])
+    load = None if platform == "xla" or jax.default_backend() != "cpu" else call.map.kernels[0]
     if load is None:
         return call(*arrays)
     _, x = call.split(arrays)
@@ -199,21 +202,26 @@ def _run_on_cpu(*arrays, call):
     return call(*arrays, function=load() if suitable else None)
 
 
-mlir.register_lowering(_linear, mlir.lower_fun(_run_on_accelerator, multiple_results=True))
-mlir.register_lowering(_linear, mlir.lower_fun(_run_on_cpu, multiple_results=True), platform="cpu")
+def _lowering(platform):
+    return mlir.lower_fun(partial(_run_on, platform), multiple_results=True)
+
+
+mlir.register_lowering(_linear, _lowering("accelerated"))
+mlir.register_lowering(_linear, _lowering("cpu"), platform="cpu")
+mlir.register_lowering(_linear, _lowering("cuda"), platform="cuda")
 ad.primitive_jvps[_linear] = _jvp
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batch
 
-_form = ContextVar("form", default="kernels")
+_form: ContextVar[str | None] = ContextVar("form", default=None)
 
 
 @contextmanager
-def compiled_for_cpu(form: Literal["xla", "accelerated"]) -> Iterator[None]:
+def compiled_for_cpu(form: Literal["xla", "accelerated", "cuda"]) -> Iterator[None]:
     """How CPUs run what is compiled within this context.
 
-    `"xla"`: without kernels; for a single call that is faster than to import numba. `"accelerated"`: as GPUs and TPUs
-    do, for tests: that is far slower.
+    `"xla"`: without kernels; for a single call that is faster than to import numba. `"accelerated"` and `"cuda"`: as
+    TPUs and NVIDIA's GPUs do, for tests: that is far slower.
     """
     token = _form.set(form)
     try:

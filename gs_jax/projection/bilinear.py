@@ -9,10 +9,10 @@ back-projection is dB/d(volume), the ray-optics image of a volume is dB/d(image)
 geometry, which JAX propagates to lens positions, distances and depths. Each is written out because JAX would transpose
 the gather to a scatter, which is twenty times slower on a CPU.
 
-The forms here are for CPUs without kernels; those for GPUs and TPUs are in `tiles`. Each scans the lenses, one patch of
-voxels at a time and all depths at once, so that the memory is image + volume + one patch. `lax.cond` skips lenses that
-see no voxel. It also stops XLA from fusing the loop body into one in-place update on one core: what a branch returns is
-computed separately, on all cores.
+The forms here are for CPUs without kernels; those for GPUs and TPUs are in `tiles` and `cuda`. Each scans the lenses,
+one patch of voxels at a time and all depths at once, so that the memory is image + volume + one patch. `lax.cond` skips
+lenses that see no voxel. It also stops XLA from fusing the loop body into one in-place update on one core: what a
+branch returns is computed separately, on all cores.
 """
 
 from functools import partial
@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ..linear.linear_map import LinearMap
-from . import tiles
+from . import cuda, tiles
 from .cpu.loading import kernels
 from .rays import Axis, Pair, Rays, Shapes, interpolate, pairs
 
@@ -134,6 +134,7 @@ image_to_volume = LinearMap(
     rays_vjp,
     kernels=kernels("gather", "scatter"),
     accelerated=(tiles.gather, tiles.scatter),
+    cuda=(cuda.gather, cuda.scatter),
 )
 volume_to_image = image_to_volume.T
 

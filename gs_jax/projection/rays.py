@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..base.typing import Scalar
-from ..microscope.geometry import Imager, chief_ray, envelope, field_limit
+from ..microscope.geometry import FALLOFF, Imager, chief_ray, envelope, field_limit
 from ..microscope.grid import Grid
 from ..optics.psf_core import ring_light
 
@@ -59,6 +59,21 @@ class RingLight(NamedTuple):
 
     def __call__(self, distance2, parameters):
         return ring_light(distance2, parameters, self.inner, self.outer)
+
+
+def weight_numbers(weight):
+    """Encode a weight for a kernel: kind, cutoff, falloff slope, the same for its hole (0 if none), scale."""
+
+    def falloff(radius):
+        exists = radius > 0
+        slope = jnp.where(exists, 1 / (2 * FALLOFF * jnp.where(exists, radius, 1) ** 2), 0)
+        return field_limit(radius) ** 2, slope
+
+    if isinstance(weight, Envelope):
+        numbers = (0, *falloff(weight.field_radius), 0, 0, 0)
+    else:
+        numbers = (1, *falloff(weight.outer), *falloff(weight.inner), 1 / weight.outer**2)
+    return jnp.stack([jnp.asarray(number, jnp.float32) for number in numbers])
 
 
 class Rays(NamedTuple):

@@ -21,6 +21,7 @@ from ..microscope.geometry import Imager
 from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
 from .cpu.loading import kernels
+from .cuda import SCATTERS
 
 # Lenses whose stray light is computed at once, which bounds the memory.
 _LENSES = 112
@@ -151,9 +152,9 @@ def _add_windows(windows, places, spots):
 
 
 def _sum_windows(windows, places, spots):
-    """`_add_windows` for GPUs and TPUs: each pixel looks into every window, in one sum over all.
+    """`_add_windows` for accelerators whose scatter-add is slow: each pixel looks into every window, in one sum.
 
-    JAX before 0.11.1 compiles a scatter-add slowly for GPUs. On a CPU this takes 2 to 15 times as long as one.
+    On a CPU this takes 2 to 15 times as long as a scatter-add.
     """
     (start, fraction), size = places, windows.side + 1
     read = jax.ShapeDtypeStruct((len(start), size, size), spots.dtype)
@@ -178,6 +179,7 @@ interpolate_windows = LinearMap(
     _add_windows,
     kernels=kernels("read_windows", "add_windows"),
     accelerated=(None, _sum_windows),
+    cuda=(None, _add_windows if SCATTERS else None),
 )
 
 

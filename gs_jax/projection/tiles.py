@@ -2,14 +2,16 @@
 
 The forms in `bilinear` take one lens after the other, as suits a CPU's caches. A GPU would wait for hundreds of small
 kernels. Here the volume, or the image, is cut into square tiles, each with a list of the lenses that reach it, and one
-kernel computes all tiles for the next lenses of each list: gathers fused with the sum over lenses or depths. Nothing is
-scattered, nothing depends on a condition, and only tables of an axis and the result are stored.
+kernel computes all tiles for the next lenses of each list: gathers fused with the sum over lenses or depths. Nothing
+depends on a condition, and only tables of an axis and the result are stored. `scatter` gathers, too, for TPUs and for
+versions of JAX that add floats on GPUs by loops that wait for each other; `add_to_pixels` scatters.
 
 The length of the lists depends on the centres and the magnification, which may be traced. So each projection has one
 loop with a traced number of steps. The bound that is known before, the number of lenses, would be several times as much
 work.
 """
 
+import math
 from itertools import product
 from typing import NamedTuple
 
@@ -20,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .rays import OUTSIDE, Axis, Rays, Shapes, interpolate, pairs
 
 # Sides of a tile of voxels and of a tile of pixels.
-_VOXELS, _PIXELS = 16, 32
+VOXELS, _PIXELS = 16, 32
 # Lenses of each tile of voxels that are summed in one step: lists are long. Those of pixels hold a few lenses.
 _LENSES = 8
 # Pixels times depths that are computed at once, which bounds the memory: the tables take 1.5 bytes for each.
@@ -31,35 +33,64 @@ _REACH = 1.01
 
 def gather(shapes: Shapes, rays: Rays, image) -> Float[Array, "depth y x"]:
     """`bilinear.image_to_volume`."""
-    depths, *sides = shapes.volume
-    tall, wide = counts = [-(-n // _VOXELS) for n in sides]
-    voxels = [axis.start[..., None] + _numbers(axis.pixel.shape[2], axis=2, of=3) for axis in (rays.y, rays.x)]
-    lists, lengths = _lenses_of_tiles(shapes, rays, [(n // _VOXELS, n // _VOXELS) for n in voxels], counts)
-    lenses = lists.shape[2]
+    lists, lengths = lenses_of_voxels(shapes, rays)
+    tall, wide, lenses = lists.shape
     lists = jnp.pad(lists, [(0, 0), (0, 0), (0, -lenses % _LENSES)], constant_values=lenses)
-    # Axes: lens, depth, row of tiles, row, column of tiles, column.
-    depth = _numbers(depths, axis=1, of=6)
-    row = _numbers(tall, axis=2, of=6) * _VOXELS + _numbers(_VOXELS, axis=3, of=6)
-    column = _numbers(wide, axis=4, of=6) * _VOXELS + _numbers(_VOXELS, axis=5, of=6)
-    y_pair, x_pair = pairs(shapes, rays)
-    parameters = rays.parameters[None, :, None, None, None, None]
 
     def add_lenses(step, volume):
-        lens = lax.dynamic_slice_in_dim(lists, step * _LENSES, _LENSES, axis=2)
-        lens = jnp.moveaxis(lens, 2, 0)[:, None, :, None, :, None]
-        y = _place(rays.y, lens, depth, row - _start(rays.y, lens, depth))
-        x = _place(rays.x, lens, depth, column - _start(rays.x, lens, depth))
-        weight = rays.weight(_distance2(rays.y, y) + _distance2(rays.x, x), parameters)
+        weight, pixel, fractions = _rays_of_tiles(shapes, rays, lists, step, _LENSES)
         if image is not None:
-            pixel = _take(y_pair.low, y.at) * shapes.image[1] + _take(x_pair.low, x.at)
             corners = [_take(image, pixel + down + right) for down in (0, shapes.image[1]) for right in (0, 1)]
-            fractions = _take(y_pair.fraction, y.at), _take(x_pair.fraction, x.at)
             weight = weight * interpolate([corner.astype(weight.dtype) for corner in corners], *fractions)[0]
         return volume + weight.sum(0)
 
-    volume = jnp.zeros((depths, tall, _VOXELS, wide, _VOXELS), rays.parameters.dtype)
+    depths, *sides = shapes.volume
+    volume = jnp.zeros((depths, tall, VOXELS, wide, VOXELS), rays.parameters.dtype)
     volume = lax.fori_loop(0, -(-lengths.max() // _LENSES), add_lenses, volume)
-    return volume.reshape(depths, tall * _VOXELS, wide * _VOXELS)[:, : sides[0], : sides[1]]
+    return volume.reshape(depths, tall * VOXELS, wide * VOXELS)[:, : sides[0], : sides[1]]
+
+
+def add_to_pixels(shapes: Shapes, rays: Rays, volume) -> Float[Array, "row column"]:
+    """`scatter` as a scatter-add, one lens of each tile at a time, for compilers that add floats without loops."""
+    lists, lengths = lenses_of_voxels(shapes, rays)
+    tall, wide, _ = lists.shape
+    missing = [(0, 0), *((0, count * VOXELS - n) for count, n in zip((tall, wide), shapes.volume[1:], strict=True))]
+    volume = jnp.pad(volume, missing).reshape(1, 1, -1, tall, VOXELS, wide, VOXELS)
+    # The first axis has the four pixels around each ray.
+    corner = _numbers(4, axis=0, of=7)
+    down, right = corner // 2, corner % 2
+
+    def add_lens(step, image):
+        weight, pixel, fractions = _rays_of_tiles(shapes, rays, lists, step, 1)
+        light = weight[None] * volume
+        for is_next, fraction in zip((down, right), fractions, strict=True):
+            light = light * jnp.where(is_next == 1, fraction[None], 1 - fraction[None])
+        # What adds nothing is beyond the image, and dropped.
+        place = jnp.where(weight != 0, pixel, image.size)[None] + down * shapes.image[1] + right
+        return image.at[place].add(light, mode="drop", wrap_negative_indices=False)
+
+    image = jnp.zeros(math.prod(shapes.image), volume.dtype)
+    return lax.fori_loop(0, lengths.max(), add_lens, image).reshape(shapes.image)
+
+
+def _rays_of_tiles(shapes, rays, lists, step, count):
+    """The rays of some lenses of each tile: weights, pixels above to the left, fractions of the way down and right.
+
+    Axes: lens, depth, row of tiles, row, column of tiles, column.
+    """
+    tall, wide, _ = lists.shape
+    lens = jnp.moveaxis(lax.dynamic_slice_in_dim(lists, step * count, count, axis=2), 2, 0)
+    lens = lens[:, None, :, None, :, None]
+    depth = _numbers(shapes.volume[0], axis=1, of=6)
+    row = _numbers(tall, axis=2, of=6) * VOXELS + _numbers(VOXELS, axis=3, of=6)
+    column = _numbers(wide, axis=4, of=6) * VOXELS + _numbers(VOXELS, axis=5, of=6)
+    y_pair, x_pair = pairs(shapes, rays)
+    y = _place(rays.y, lens, depth, row - _start(rays.y, lens, depth))
+    x = _place(rays.x, lens, depth, column - _start(rays.x, lens, depth))
+    distance2 = _distance2(rays.y, y) + _distance2(rays.x, x)
+    pixel = _take(y_pair.low, y.at) * shapes.image[1] + _take(x_pair.low, x.at)
+    fractions = _take(y_pair.fraction, y.at), _take(x_pair.fraction, x.at)
+    return rays.weight(distance2, rays.parameters[None, :, None, None, None, None]), pixel, fractions
 
 
 def scatter(shapes: Shapes, rays: Rays, volume) -> Float[Array, "row column"]:
@@ -101,6 +132,13 @@ def scatter(shapes: Shapes, rays: Rays, volume) -> Float[Array, "row column"]:
     in_bands = [a.reshape(bands, band, *a.shape[1:]) for a in (lists, lengths)]
     image = lax.map(image_of_band, (first, *in_bands))
     return image.reshape(bands * band * _PIXELS, wide * _PIXELS)[: shapes.image[0], : shapes.image[1]]
+
+
+def lenses_of_voxels(shapes: Shapes, rays: Rays) -> tuple[Int[Array, "row column place"], Int[Array, "row column"]]:
+    """`_lenses_of_tiles` of `VOXELS` x `VOXELS` voxels."""
+    voxels = [axis.start[..., None] + _numbers(axis.pixel.shape[2], axis=2, of=3) for axis in (rays.y, rays.x)]
+    counts = [-(-n // VOXELS) for n in shapes.volume[1:]]
+    return _lenses_of_tiles(shapes, rays, [(n // VOXELS, n // VOXELS) for n in voxels], counts)
 
 
 def _lenses_of_tiles(shapes, rays, ends, counts) -> tuple[Int[Array, "row column place"], Int[Array, "row column"]]:

@@ -19,8 +19,7 @@ from numba import cfunc, types
 from numba.core.caching import FunctionCache
 
 from ...linear.fourier import kernel_spectrum
-from ...microscope.geometry import FALLOFF, field_limit
-from ..rays import Envelope, Rays
+from ..rays import Rays, weight_numbers
 from . import ffi, fftconv, kernels, windows
 from .simd import FAST, WIDTH
 
@@ -173,21 +172,6 @@ def _pixels(shapes, image):
         return jnp.ones((), bool)
     _require("of rays", image.shape == shapes.image, image)
     return image if image.dtype in (jnp.uint8, jnp.uint16) else image.astype(jnp.float32)
-
-
-def weight_numbers(weight):
-    """Encode a weight for a kernel: kind, cutoff, falloff slope, the same for its hole (0 if none), scale."""
-
-    def falloff(radius):
-        exists = radius > 0
-        slope = jnp.where(exists, 1 / (2 * FALLOFF * jnp.where(exists, radius, 1) ** 2), 0)
-        return field_limit(radius) ** 2, slope
-
-    if isinstance(weight, Envelope):
-        numbers = (0, *falloff(weight.field_radius), 0, 0, 0)
-    else:
-        numbers = (1, *falloff(weight.outer), *falloff(weight.inner), 1 / weight.outer**2)
-    return jnp.stack([jnp.asarray(number, jnp.float32) for number in numbers])
 
 
 def convolve(sizes, kernels, sharp):

@@ -18,7 +18,7 @@ ZERO, HALF, ONE, TWO, THREE, SIX, FAR = (np.float32(n) for n in (0, 0.5, 1, 2, 3
 
 
 class Tables(NamedTuple):
-    """`rays.Rays`, and the numbers of the weight (`dispatch.weight_numbers`)."""
+    """`rays.Rays`, and the numbers of the weight (`rays.weight_numbers`)."""
 
     numbers: np.ndarray
     parameters: np.ndarray
