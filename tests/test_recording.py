@@ -12,12 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 import tifffile
 import zarr
 
 import gs_jax as gs
+from gs_jax.base import machine
 from gs_jax.base.errors import InputWarning
 from gs_jax.io import ngff
 from gs_jax.io.captures import Selection
@@ -270,6 +272,27 @@ def test_points_of_all_frames_in_one_table(folder, run):
     run(*command("rec.tif", *how[:2], "--page", "3", "--points", "q.csv", output="w.zarr"))
     alone = np.loadtxt(folder / "q.csv", delimiter=",", skiprows=1, ndmin=2)
     np.testing.assert_allclose(alone, found[found[:, 4] == 2, :4], rtol=1e-6)
+
+
+@pytest.mark.integration
+def test_an_accelerator_gets_counts_ahead(folder, run, monkeypatch):
+    """The processor, in place of one."""
+    copied = []
+
+    def copy(device, counts):
+        copied.append(machine.copy_to(device, counts))
+        return copied[-1]
+
+    monkeypatch.setattr("gs_jax.cli.recordings.accelerator", lambda: jax.devices()[0])
+    monkeypatch.setattr("gs_jax.cli.recordings.copy_to", copy)
+    frames = FRAMES // 100 + 100
+    frames[2, 40, 40] = 65535  # filled from neighbours, and then no integer
+    status, *_ = run(*command(save("rec.tif", frames)))
+    assert status == 0 and [image.dtype.name for image in copied] == ["uint16"] * 4
+    assert {image.sharding.memory_kind for image in copied} == {jax.devices()[0].default_memory().kind}
+    kept = [0, 1, 3, 4]
+    # Compiled for another type.
+    np.testing.assert_allclose(volumes()[kept], expected(frames[kept]), rtol=1e-4)
 
 
 def test_it_is_compiled_once(folder, run):

@@ -54,6 +54,25 @@ def cpu_device() -> Any:
         return jax.devices()[0]
 
 
+def accelerator() -> Any:
+    """The GPU or TPU as a device of JAX, if there is one; None on a processor, and with several, which share work."""
+    import jax
+
+    devices = jax.local_devices()
+    return devices[0] if len(devices) == 1 and devices[0].platform != "cpu" else None
+
+
+def copy_to(device: Any, array: Any) -> Any:
+    """Start to copy an array to a device: from page-locked memory if it has such, while it computes."""
+    from jax import device_put
+    from jax.sharding import SingleDeviceSharding
+
+    locked = [memory.kind for memory in device.addressable_memories() if memory.kind == "pinned_host"]
+    for kind in (*locked, device.default_memory().kind):
+        array = device_put(array, SingleDeviceSharding(device, memory_kind=kind))
+    return array
+
+
 def available_memory() -> int:
     """Bytes that this process can take without swapping."""
     return psutil.virtual_memory().available

@@ -277,10 +277,8 @@ class CaptureOptions(PictureOptions):
     def frames(self, recording):
         """Read the correction of a recording; return the function that reads a frame.
 
-        It returns the frame's image, float32, and lines about corrections and warnings of this frame alone.
+        It returns the frame's image, and lines about corrections and warnings of this frame alone.
         """
-        import numpy as np
-
         from ..io.camera import prepare, read_frame
         from ..io.captures import Selection
 
@@ -296,8 +294,7 @@ class CaptureOptions(PictureOptions):
             done, warnings = (
                 [line for line in lines if line not in shared] for lines in (capture.done, capture.warnings)
             )
-            # One type for all frames, so that nothing is compiled twice.
-            return np.asarray(capture.image, np.float32), done, warnings
+            return capture.image, done, warnings
 
         return read
 

@@ -16,6 +16,7 @@ import click
 import numpy as np
 
 from ..base.errors import InputError, InputWarning
+from ..base.machine import accelerator, copy_to
 from ..base.progress import Progress
 from ..base.workers import Workers
 from .commands import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
@@ -279,8 +280,14 @@ def _frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False
     # Only the first frame is checked; an iterator gives one item to one thread.
     checks = iter([plan.check] if plan.is_learned else [])
 
+    device = accelerator() if plan.reads_pixels_once and not is_live else None
+
     def read(frame):
-        return frame, *image_of(frame)
+        image, *lines = image_of(frame)
+        if device and image.dtype.kind == "u":
+            return frame, copy_to(device, image), *lines
+        # One type for all frames, so that nothing is compiled twice.
+        return frame, np.asarray(image, np.float32), *lines
 
     def make(frame, last):
         number, image, done, warnings = frame

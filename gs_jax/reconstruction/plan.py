@@ -18,7 +18,16 @@ from ..solvers.richardson_lucy import State as LucyState, restarted
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from .networks import read_unrolled
-from .pipeline import METHODS, PIXELS_PER_VOXEL, STEPPED, Method, Reconstructor, method_by_name, voxel_grid
+from .pipeline import (
+    METHODS,
+    PIXELS_PER_VOXEL,
+    STEPPED,
+    BackProjection,
+    Method,
+    Reconstructor,
+    method_by_name,
+    voxel_grid,
+)
 from .residual import CrossValidation, ForwardResidual, cross_validated, forward_residual
 from .surface_fit import SurfaceFit, follow_sheets
 
@@ -116,6 +125,11 @@ class Plan:
         if self._finds_points:
             sharp = sharpness(self.imager, self.grid)
         return dataclasses.replace(self, network=network, reconstructor=reconstructor, sharpness=sharp)
+
+    @property
+    def reads_pixels_once(self) -> bool:
+        """Whether an image is only back-projected, as the camera's integers, too."""
+        return isinstance(self.method, BackProjection) and not self._finds_points
 
     @property
     def _finds_points(self) -> bool:
