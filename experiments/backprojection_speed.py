@@ -2,9 +2,10 @@
 
 The paper takes 18 s for an image of 5120^2 pixels, 13 depths of 555^2 voxels and 213 lenses (MATLAB, nearest pixel,
 8 threads). On a processor `gs_jax` runs the same problem against the paper's loop and per-lens patches in parallel
-numba, which compute the same sum (bilinear, float32) on all cores. On a GPU or TPU it runs against kernels in CUDA,
-where CuPy is installed: "of many" is the time of a call where ten are started one after the other, and "from the host"
-includes the transfer of a camera's uint16 image. Results are compared before they are timed in interleaved rounds.
+numba, which compute the same sum (bilinear, float32) on all cores. On a GPU or TPU it runs by kernels of Warp, where
+that is installed, against XLA's forms: "of many" is the time of a call where ten are started one after the other, and
+"from the host" includes the transfer of a camera's uint16 image. Results are compared before they are timed in
+interleaved rounds.
 
     python -m experiments.backprojection_speed [--out DIR]
 
@@ -12,26 +13,32 @@ Writes `speed.json`, `speed.md` and, on a processor, `speed.png`; about six minu
 """
 
 import os
+import re
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import cache, partial
 from multiprocessing import get_context
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import SingleDeviceSharding
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from experiments.kernels import count_pairs, cuda_kernels, lens_patches, paper_loop, plain
+from experiments.kernels import count_pairs, lens_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Progress, Sensor, backproject, backproject_adjoint, random_layout
 from gs_jax.apps.benchmark import markdown_table, peak_mib, timed
 from gs_jax.base.arrays import to_float32
-from gs_jax.base.machine import describe, status_mib
+from gs_jax.base.machine import copy_to, describe, status_mib
+from gs_jax.projection import cuda
 
 FIELD_MM = 5120 * 0.0045
 
@@ -131,9 +138,13 @@ CONTESTANTS = {
     "gs_jax, Hessian-vector product": Contestant(jax.jit(hessian_vector_product), _whole),
 }
 OURS = tuple(name for name in CONTESTANTS if name.startswith("gs_jax"))
-FROM_HOST = "gs_jax, uint16 image from the host"
-# Kernels in CUDA, with the contestants that compute the same.
-BY_HAND = {"CUDA by hand": "gs_jax", "CUDA by hand, adjoint": "gs_jax, adjoint"}
+FROM_HOST = ("gs_jax, uint16 image from the host", "the same, copied ahead", "the same, from page-locked memory")
+# What `gs_jax.projection.cuda` may run without Warp: back-projection and its adjoint by XLA.
+FORMS = {
+    "gs_jax, XLA": ("gs_jax", {"_load": lambda: None}),
+    "gs_jax, adjoint, XLA's scatter-add": ("gs_jax, adjoint", {"_load": lambda: None, "SCATTERS": True}),
+    "gs_jax, adjoint, XLA's gathers": ("gs_jax, adjoint", {"_load": lambda: None, "SCATTERS": False}),
+}
 SAME_RESULT = ("gs_jax", "numba, the paper's loop", "numba, lens patches")
 IN_STUDY = ("gs_jax", "gs_jax, adjoint", "numba, lens patches")
 
@@ -188,15 +199,12 @@ def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
 
 def check(s: Inputs, results: Mapping[str, Any]) -> None:
     """Check that all implementations compute the same sum, and that the adjoint is the adjoint of it."""
-    results = {name: result.get() if hasattr(result, "get") else np.asarray(result) for name, result in results.items()}
-    # Coordinates of CUDA kernels are float32, some 1e-3 of a pixel, and the image is random.
-    limits = [(name, "gs_jax", 1e-5) for name in SAME_RESULT] + [
-        (theirs, ours, 5e-3) for theirs, ours in BY_HAND.items()
-    ]
-    for theirs, ours, limit in limits:
+    results = {name: np.asarray(result) for name, result in results.items()}
+    pairs = [(name, "gs_jax") for name in SAME_RESULT] + [(name, ours) for name, (ours, _) in FORMS.items()]
+    for theirs, ours in pairs:
         if theirs in results:
             error = np.abs(results[theirs] - results[ours]).max() / results[ours].max()
-            assert error < limit, f"{theirs} differs from gs_jax by {error:.1e} of the maximum"
+            assert error < 1e-5, f"{theirs} differs from gs_jax by {error:.1e} of the maximum"
     if "gs_jax, adjoint" in results:
         back = np.vdot(results["gs_jax"].astype(float), np.asarray(s.volume, float))
         forth = np.vdot(np.asarray(s.image, float), results["gs_jax, adjoint"].astype(float))
@@ -205,18 +213,31 @@ def check(s: Inputs, results: Mapping[str, Any]) -> None:
 
 def on_accelerator(job: Job, rounds: int = 9, many: int = 10) -> dict:
     """Median seconds of a call alone and of a call of many, by contestant, and memory beside arguments and results."""
-    s, calls, compiled_s, memory = inputs(job), {}, {}, {}
-    for name in OURS:
-        arguments = jax.device_put(CONTESTANTS[name].arguments(s))
-        lowered = jax.jit(CONTESTANTS[name].function).lower(*arguments)
-        compiled_s[name], compiled = timed(lowered.compile)
-        calls[name] = partial(compiled, *arguments)
-        memory[name] = compiled.memory_analysis().temp_size_in_bytes / 2**20
-    counts = np.asarray(_as_uint16(s.image))
-    calls[FROM_HOST] = lambda: backproject(jax.device_put(counts), s.imager, s.grid)
-    if by_hand := cuda_kernels(plain(s.imager, s.grid), np.asarray(s.image), np.asarray(s.volume)):
-        calls |= dict(zip(BY_HAND, by_hand, strict=True))
-    check(s, {name: calls[name]() for name in (*BY_HAND.values(), *BY_HAND) if name in calls})
+    s, calls, compiled = inputs(job), {}, {}
+    for name, (of, form) in ({name: (name, {}) for name in OURS} | FORMS).items():
+        arguments, function = jax.device_put(CONTESTANTS[of].arguments(s)), CONTESTANTS[of].function
+        with patch.multiple(cuda, **form) if form else nullcontext():
+            # A new function, which is lowered anew.
+            lowered = jax.jit(lambda *arguments, function=function: function(*arguments)).lower(*arguments)
+        seconds, program = timed(lowered.compile)
+        calls[name] = partial(program, *arguments)
+        memory = program.memory_analysis().temp_size_in_bytes / 2**20
+        # Fusions and calls of libraries, those of a loop once.
+        kernels = len(re.findall(r" (?:fusion|custom-call|fft|sort)\(", program.as_text()))
+        compiled[name] = {"compile_s": seconds, "memory_mib": memory, "kernels": kernels}
+    counts, device, reader = np.asarray(_as_uint16(s.image)), jax.devices()[0], ThreadPoolExecutor(1)
+    ahead = deque(reader.submit(copy_to, device, counts) for _ in range(2))
+    there, lock = (SingleDeviceSharding(device, memory_kind=kind) for kind in (None, "pinned_host"))
+    locked = jax.device_put(counts, lock)
+
+    def copied_ahead():
+        ahead.append(reader.submit(copy_to, device, counts))
+        return ahead.popleft().result()
+
+    sources = (lambda: jax.device_put(counts)), copied_ahead, (lambda: jax.device_put(locked, there))
+    for name, source in zip(FROM_HOST, sources, strict=True):
+        calls[name] = lambda source=source: backproject(source(), s.imager, s.grid)
+    check(s, {name: calls[name]() for name in ("gs_jax", "gs_jax, adjoint", *FORMS)})
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
@@ -227,7 +248,7 @@ def on_accelerator(job: Job, rounds: int = 9, many: int = 10) -> dict:
     for name, seconds in times.items():
         alone, of_many = np.median(seconds, axis=0).tolist()
         medians[name] = {"alone_s": alone, "many_s": of_many, "pairs_per_s": pairs / of_many}
-        medians[name] |= {"compile_s": compiled_s.get(name), "memory_mib": memory.get(name)}
+        medians[name] |= compiled.get(name, {})
     for row in medians.values():
         row["ratio"] = row["many_s"] / medians["gs_jax"]["many_s"]
     return {"job": str(job), "pairs": pairs, "contestants": medians}
@@ -309,6 +330,7 @@ COLUMNS = {
     "pairs_per_s": ("pairs / s", 1, ".2e"),
     "extra_mib": ("memory, MiB", 1, ".0f"),
     "memory_mib": ("memory, MiB", 1, ".0f"),
+    "kernels": ("kernels", 1, ".0f"),
 }
 
 

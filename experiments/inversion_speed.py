@@ -1,138 +1,102 @@
-"""Time and memory of the forward models, the iterative methods at their defaults, and three other functions.
+"""Time, memory and quality of the forward models, the iterative methods at their defaults, and three other functions.
 
-The scene has bars of three widths and points at nine depths, and its capture 5120 x 5120 pixels, rendered by the full
-model. Each line runs in a process of its own; the first call is timed apart, as it compiles.
+The scene is ray-traced: with DATA another group's captures of 5120 x 5120 pixels, of letters at nine depths and, for
+`find_points`, of points; without it letters of another device, by our tracer. Each line runs in a process of its own;
+the first call is timed apart, as it compiles. "dB" is the PSNR above that of an empty volume (`gs_jax.quality`).
 
-    python -m experiments.inversion_speed [--methods list-rl,richardson-lucy] [--pixels 5120] [--out DIR]
+    python -m experiments.inversion_speed [DATA] [--methods list-rl,richardson-lucy] [--beside CHECKOUT] [--out DIR]
 
-Writes `inversion_speed.json` and `inversion_speed.md`; about four minutes on two cores.
+With `--beside` each line also runs in a second process with the package of CHECKOUT, in turns, and "faster" is the
+ratio of their times. On a GPU or TPU the tables of `backprojection_speed` come first, and "launches" are kernels and
+copies in a call. Writes `inversion_speed.json` and `inversion_speed.md`; about five minutes on two cores.
 """
 
-import tempfile
-import time
-from collections.abc import Callable
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
 import gs_jax as gs
-from experiments.backprojection_speed import in_new_process
-from experiments.common import Report, main, names_of, tables_report
-from gs_jax.base.machine import status_mib
-from gs_jax.reconstruction.inverse_problem import prepare_model
-from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
+from experiments.common import OPTIONAL_PATH, Report, main, names_of, tables_report
 
-DEPTHS = np.linspace(18.0, 22.0, 9).tolist()
-MODELS = ("near", "full")
-# `find_points`, `simulate`, and the network that suppresses haze.
-OTHERS = "others"
-NAMES = (*MODELS, "list-rl", "richardson-lucy", "unrolled", "fista", "admm", OTHERS)
-# Later calls of the models; a method takes long, and gets one.
+HERE = Path(__file__).parents[1]
+METHODS = ("list-rl", "richardson-lucy", "unrolled", "fista", "admm")
+# Others: `find_points`, `simulate`, and the network that suppresses haze.
+NAMES = ("near", "full", *METHODS, "others")
+# Later calls; a method takes long, and gets one, unless it is compared.
 ROUNDS = 3
 COLUMNS = {
     "first_s": ("first call, s", ".1f"),
     "clock_s": ("later calls, s", ".2f"),
     "processor_s": ("processors, s", ".2f"),
+    "faster": ("faster", ".2f"),
     "memory_mib": ("MiB", ".0f"),
+    "db": ("dB", ".2f"),
+    "launches": ("launches", ".0f"),
 }
 
 
-def measure(call: Callable[[], Any], rounds: int) -> tuple[dict[str, float], Any]:
-    """Seconds of the first call and of later ones, by the clock (median) and processors (least), and the result."""
-    clock, processor, result = [], [], None
-    for _ in range(1 + rounds):
-        before = time.perf_counter(), time.process_time()
-        result = call()
-        clock.append(time.perf_counter() - before[0])
-        processor.append(time.process_time() - before[1])
-    return {"first_s": clock[0], "clock_s": float(np.median(clock[1:])), "processor_s": min(processor[1:])}, result
+@contextmanager
+def process(checkout: Path, name: str, data: str) -> Iterator[Callable[[], Any]]:
+    """Start a process with the package of a checkout; yields a function that asks `serve`."""
+    command = [sys.executable, "-P", str(Path(__file__).with_name("timed_calls.py")), name, data]
+    # Several processes share a GPU.
+    environment = os.environ | {"PYTHONPATH": str(checkout), "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=environment, **pipes) as worker:
+        answers: Any = worker.stdout
+
+        def ask() -> Any:
+            print(file=worker.stdin, flush=True)
+            return json.loads(answers.readline())
+
+        yield ask
 
 
-def scene(shape: tuple[int, int, int]) -> np.ndarray:
-    """A volume with bars at three depths, and points at four others."""
-    volume, (_, rows, columns) = np.zeros(shape, np.float32), shape
-    for plane, width in ((1, 3), (4, 5), (7, 9)):
-        for bar in range(5):
-            first = columns // 4 + 2 * width * bar
-            volume[plane, rows // 3 : rows // 2, first : first + width] = 1
-    for plane in (0, 2, 6, 8):
-        volume[plane, rows // 2 + 7 * plane, columns // 2 + 5 * plane] = 20
-    return volume
-
-
-def imager_of(pixels: int) -> gs.Imager:
-    """The built-in microscope with so many pixels in each direction."""
-    scope = gs.geomscope().imager()
-    return eqx.tree_at(lambda i: i.sensor, scope, gs.Sensor((pixels, pixels), scope.sensor.pixel_pitch))
-
-
-def of_model(name: str, capture: Path, pixels: int) -> dict[str, Any]:
-    """Time a forward model and its adjoint; the full model renders the capture."""
-    scope = imager_of(pixels)
-    grid = voxel_grid(scope, DEPTHS, None, pixels=PIXELS_PER_VOXEL)
-    began = time.perf_counter()
-    model = prepare_model(scope, grid, name, gs.Progress())
-    results: dict[str, Any] = {f"{name} model: tables": {"first_s": time.perf_counter() - began}}
-    A, volume = gs.ImagingOperator(model.imager, grid, model.optics), scene(grid.volume_shape)
-    forward, adjoint = jax.jit(lambda A, x: A.mv(x)), jax.jit(lambda A, y: A.T.mv(y))
-    results[f"{name} model"], image = measure(lambda: jax.block_until_ready(forward(A, volume)), ROUNDS)
-    results[f"{name} model, adjoint"], _ = measure(lambda: jax.block_until_ready(adjoint(A, image)), ROUNDS)
-    if name == "full":
-        light = np.maximum(np.kron(np.asarray(image), np.ones((model.binning, model.binning))), 0)
-        light = np.pad(light, [(0, pixels - n) for n in light.shape]) * (2000 / light.max())
-        np.save(capture, np.random.default_rng(0).poisson(light).astype(np.float32))
+def run(names: list[str], data: str, beside: Path | None, progress: gs.Progress) -> dict[str, dict[str, float]]:
+    """Seconds, memory and quality by what is timed."""
+    results, checkouts = {}, {"": HERE} if beside is None else {", before": beside, ", now": HERE}
+    for name in progress.track(names, "Timing"):
+        rounds = 1 if name in METHODS and beside is None else ROUNDS
+        with ExitStack() as stack:
+            asks = {label: stack.enter_context(process(path, name, data)) for label, path in checkouts.items()}
+            taken = [{label: ask() for label, ask in asks.items()} for _ in range(1 + rounds)]
+        for key in taken[0][next(iter(checkouts))]:
+            for label in checkouts:
+                first, *later = [round_of[label][key] for round_of in taken]
+                clock = {"first_s": first["clock_s"], "clock_s": float(np.median([row["clock_s"] for row in later]))}
+                results[key + label] = later[-1] | clock | {"processor_s": min(row["processor_s"] for row in later)}
+            if beside is not None:
+                before, now = (results[key + label] for label in checkouts)
+                now["faster"] = before["clock_s"] / now["clock_s"]
     return results
 
 
-def of_method(name: str, capture: Path, pixels: int) -> dict[str, Any]:
-    """Time a method on the capture."""
-    scope, image = imager_of(pixels), np.load(capture)
-    grid = voxel_grid(scope, DEPTHS, None, pixels=PIXELS_PER_VOXEL)
-    invert = gs.Reconstructor(scope, grid, METHODS[name](20), progress=gs.Progress())
-    seconds, _ = measure(lambda: invert(image, gs.Progress()), 1)
-    return {name: seconds | {"memory_mib": status_mib("VmHWM")}}
+def report(data: Path | None, methods: list[str], beside: Path | None, progress: gs.Progress) -> Report:
+    if beside is not None and not (beside / "gs_jax").is_dir():
+        raise gs.InputError(f"--beside must be a checkout, got {beside}.")
+    of_projections = Report({})
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    if jax.default_backend() != "cpu":
+        from experiments import backprojection_speed
 
-
-def of_others(name: str, capture: Path, pixels: int) -> dict[str, Any]:
-    """Time finding 100 points, imaging three planes, and five slices of the network."""
-    scope, rng = imager_of(pixels), np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-8, 8, (100, 2)), rng.uniform(18, 22, 100), np.ones(100)])
-    image = np.asarray(gs.simulate(points, scope))
-    counts = rng.poisson(image * (2000 / image.max())).astype(np.float32)
-    fine, three = voxel_grid(scope, DEPTHS), voxel_grid(scope, [18.0, 20.0, 22.0], pixels=PIXELS_PER_VOXEL)
-    planes = np.zeros(three.volume_shape, np.float32)
-    planes[:, 100:200, 100:120] = 1
-    slices = rng.random((5, 512, 512)).astype(np.float32)
-    calls = {
-        "find_points": lambda: gs.find_points(counts, scope, fine),
-        "simulate": lambda: np.asarray(gs.simulate(planes, scope, three)),
-        "suppress": lambda: gs.suppress(slices),
-    }
-    return {name: measure(call, ROUNDS)[0] for name, call in calls.items()}
-
-
-def run(names: list[str], pixels: int, progress: gs.Progress) -> dict[str, dict[str, float]]:
-    """Seconds and memory by what is timed."""
-    results = {}
-    with tempfile.TemporaryDirectory() as folder:
-        # Methods need the full model's capture.
-        for name in progress.track(sorted({"full", *names}, key=NAMES.index), "Timing"):
-            work = of_model if name in MODELS else of_others if name == OTHERS else of_method
-            results |= in_new_process(work, name, Path(folder) / "image.npy", pixels)
-    return results
-
-
-def report(methods: list[str], pixels: int, progress: gs.Progress) -> Report:
-    results = run(methods, pixels, progress)
+        of_projections = backprojection_speed.report(progress)
+    results = run(methods, str(data.resolve()) if data else "", beside and beside.resolve(), progress)
+    keys = [key for key in COLUMNS if any(key in row for row in results.values())]
     cell = lambda row, key: format(row[key], COLUMNS[key][1]) if key in row else ""
-    rows = [[name, *(cell(row, key) for key in COLUMNS)] for name, row in results.items()]
-    columns = ("", *(title for title, _ in COLUMNS.values()))
-    return tables_report("inversion_speed", results, (columns, rows))
+    rows = [[name, *(cell(row, key) for key in keys)] for name, row in results.items()]
+    columns = (jax.devices()[0].device_kind, *(COLUMNS[key][0] for key in keys))
+    files, shown = tables_report("inversion_speed", results, (columns, rows))
+    return Report(of_projections.files | files, [*of_projections.shown, *shown])
 
 
 if __name__ == "__main__":
     methods = {"type": names_of(NAMES), "default": NAMES}
-    main(report, {"--methods": methods, "--pixels": {"type": int, "default": 5120}})
+    main(report, {"data": OPTIONAL_PATH, "--methods": methods, "--beside": {"type": Path, "metavar": "CHECKOUT"}})

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.backprojection_speed import FROM_HOST, OURS, Job, memory, on_accelerator, report, tables
+from experiments.backprojection_speed import FORMS, FROM_HOST, OURS, Job, memory, on_accelerator, report, tables
 from experiments.common import write
 from experiments.kernels import count_pairs, lens_patches, paper_loop, plain
 from gs_jax import backproject
@@ -69,7 +69,6 @@ def test_accelerators_are_timed_at_toy_size():
     result = on_accelerator(Job(voxels=20, pixels=120, lenses=9, depths=2), rounds=1)
     ((_, columns, rows),) = tables({"jobs": [result]})
     names = [row[0] for row in rows]
-    # Without CuPy, as here, there are no kernels in CUDA.
-    assert names == [*OURS, FROM_HOST]
+    assert names == [*OURS, *FORMS, *FROM_HOST]
     assert all(row["many_s"] > 0 for row in result["contestants"].values())
     assert all(len(row) == len(columns) for row in rows)
