@@ -34,8 +34,10 @@ figures: .venv/dev
 test: .venv/dev
 	$(BIN)/python -m pytest $(PARALLEL)
 
-# What is slow by nature: other processes, browsers, the README, tutorials, experiments, all of the matrix of features.
+# What is slow by nature: other processes, browsers, the README, tutorials, experiments, all of the matrix of features;
+# and kernels of NVIDIA Warp (130 MB), on the processor.
 integration: .venv/dev
+	$(BIN)/python -m pip install --quiet 'warp-lang>=1.17'
 	$(BIN)/python -m pytest $(PARALLEL) $(TYPED) -m "integration and not slow"
 
 test-all: .venv/dev

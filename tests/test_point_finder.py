@@ -289,7 +289,7 @@ def test_ray_traced_points_are_found_and_nothing_else(scene):
     found = gs.find_points(capture, imager, grid, progress=gs.Progress())
     score = gs.localization(found, truth)
     assert score.f1 == 1
-    assert score.lateral_rmse <= 0.015 and score.axial_rmse <= (0.12 if scene == "d" else 0.2)
+    assert score.lateral_rmse <= 0.003 and score.axial_rmse <= (0.003 if scene == "d" else 0.02)
 
 
 def test_scores_of_several_captures_are_those_of_all_their_points():
