@@ -108,7 +108,6 @@ def test_a_scatter_add_gives_the_same(weight, voxels, pitch, options, monkeypatc
 
 
 @pytest.mark.integration
-@pytest.mark.integration
 @pytest.mark.parametrize(("weight", "voxels", "pitch", "options"), [getattr(c, "values", c) for c in CASES], ids=str)
 def test_kernels_of_warp_give_the_same(weight, voxels, pitch, options):
     """Compiled for the processor."""
@@ -118,7 +117,6 @@ def test_kernels_of_warp_give_the_same(weight, voxels, pitch, options):
     assert volume.any() and image.any()
 
 
-@pytest.mark.integration
 @pytest.mark.integration
 def test_kernels_of_warp_have_derivatives_and_batches():
     pytest.importorskip("warp")
@@ -134,7 +132,6 @@ def test_kernels_of_warp_have_derivatives_and_batches():
     same(derivatives, rays, image, volume, tolerance=2e-6, form="cuda")
 
 
-@pytest.mark.integration
 @pytest.mark.integration
 def test_kernels_of_warp_in_the_full_model():
     pytest.importorskip("warp")
