@@ -22,6 +22,10 @@ _WIDEST = 0.9
 _LINEAR, _NODES = 0.45, 44
 # How far beyond the widest field's chief ray light is followed on the sensor, in images of the widest field.
 _BEYOND = 0.35
+# Nodes around may be wider apart than outward by so much, so that their number is a power of two or three times one.
+_WIDER = 1.1
+# Kernels compute so many radii at once.
+_LEAST_RADII = 8
 # Inner rings of polar nodes, which are closer to each other than pixels.
 _INNER_RINGS = 4
 
@@ -72,8 +76,10 @@ def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, ex
     bend = linear / step
     count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
     largest = float(imager.magnification(float(depths.min()))) / middle
-    radii = count((1 + _BEYOND) * largest * widest / step)
-    return PolarGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
+    radii = max(count((1 + _BEYOND) * largest * widest / step), _LEAST_RADII)
+    around = math.log2(2 * math.pi * bend / _WIDER)
+    angles = min(2 ** math.ceil(around), 3 * 2 ** math.ceil(around - math.log2(3)))
+    return PolarGrid(step, pixel, bend, angles, count(widest / step), radii)
 
 
 def polar_weights(

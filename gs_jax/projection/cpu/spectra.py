@@ -1,0 +1,227 @@
+"""Spectra over the angle of what lies about lenses, and their products with the stray light's table, in numba.
+
+A kernel `(job, part)` as in `kernels`. The last axis is that of the lenses, a multiple of sixteen. Spectra are
+`(2 harmonics, field, lens)`, of each harmonic the real part before the imaginary one. Two fields are transformed at
+once, as the real and the imaginary part of one complex sequence.
+"""
+
+import numpy as np
+
+from . import rows, simd
+from .fftconv import plane_bytes, transform, transform_back
+from .gather import align, scratch
+from .rows import HALF, PARTS, ZERO
+from .simd import WIDTH, carray, inline
+
+# Bytes of sixteen numbers.
+_STEP = 4 * WIDTH
+# Radii at once; a table's zeros are skipped in blocks of so many.
+ROWS = 8
+
+
+@inline
+def _sum_entries(start, column, share, row, at, stride):
+    """A row of a sparse matrix times sixteen columns, which begin at `at` and whose rows are `stride` bytes apart."""
+    total = simd.zeros()
+    for entry in range(np.int64(start[row]), np.int64(start[row + 1])):
+        total = total + share[entry] * simd.load(at + stride * np.int64(column[entry]))
+    return total
+
+
+def to_spectra(job_address, part, _):
+    """A sparse matrix to polar nodes `(angle, field)`, and their spectra; a part is some pairs of fields."""
+    job = rows.job_at(job_address)
+    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
+    turns, order, side = rows.address(job, 3), rows.integers(job, 4)[:, 0, 0], rows.size(job, 4, 0)
+    at_x, stride, at_result = rows.address(job, 5), 4 * rows.size(job, 5, 1), rows.address(job, 6)
+    fields, plane = rows.size(job, 6, 1), plane_bytes(side)
+    strip = scratch(plane // 2 + WIDTH)
+    at = align(strip)
+    pairs = (fields + 1) // 2
+    for pair in range(part * pairs // job[PARTS], (part + 1) * pairs // job[PARTS]):
+        # The last may have no second: it is its own.
+        one, two = 2 * pair, min(2 * pair + 1, fields - 1)
+        for lens in range(0, stride, _STEP):
+            for angle in range(side):
+                first = _sum_entries(start, column, share, angle * fields + one, at_x + lens, stride)
+                second = _sum_entries(start, column, share, angle * fields + two, at_x + lens, stride)
+                simd.store(at + _STEP * angle, first)
+                simd.store(at + plane + _STEP * angle, second)
+            transform(at, side, turns)
+            for harmonic in range(side // 2 + 1):
+                here, there = at + _STEP * order[harmonic], at + _STEP * order[(side - harmonic) % side]
+                a, b, c, d = simd.load(here), simd.load(here + plane), simd.load(there), simd.load(there + plane)
+                at_real = at_result + 2 * harmonic * fields * stride + lens
+                at_imaginary = at_real + fields * stride
+                simd.store(at_real + one * stride, HALF * (a + c))
+                simd.store(at_imaginary + one * stride, HALF * (b - d))
+                simd.store(at_real + two * stride, HALF * (b + d))
+                simd.store(at_imaginary + two * stride, HALF * (c - a))
+    return rows.keep_alive((strip,))
+
+
+def from_spectra(job_address, part, _):
+    """The adjoint of `to_spectra`, with the transposed matrix; a part is some lenses."""
+    job = rows.job_at(job_address)
+    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
+    turns, order, side = rows.address(job, 3), rows.integers(job, 4)[:, 0, 0], rows.size(job, 4, 0)
+    fields, stride, at_result = rows.size(job, 5, 1), 4 * rows.size(job, 5, 2), rows.address(job, 6)
+    nodes, plane, blocks = rows.size(job, 6, 0), plane_bytes(side), stride // _STEP
+    strip, polar = scratch(plane // 2 + WIDTH), scratch((side * fields + 1) * WIDTH)
+    at, at_polar = align(strip), align(polar)
+    for block in range(part * blocks // job[PARTS], (part + 1) * blocks // job[PARTS]):
+        lens = _STEP * block
+        for one in range(0, fields, 2):
+            two = min(one + 1, fields - 1)
+            for harmonic in range(side // 2 + 1):
+                at_real = rows.address(job, 5) + 2 * harmonic * fields * stride + lens
+                at_imaginary = at_real + fields * stride
+                a, b = simd.load(at_real + one * stride), simd.load(at_imaginary + one * stride)
+                c, d = simd.load(at_real + two * stride), simd.load(at_imaginary + two * stride)
+                here, there = at + _STEP * order[harmonic], at + _STEP * order[(side - harmonic) % side]
+                if here == there:
+                    simd.store(here, a)
+                    simd.store(here + plane, c)
+                else:
+                    simd.store(here, HALF * (a - d))
+                    simd.store(here + plane, HALF * (b + c))
+                    simd.store(there, HALF * (a + d))
+                    simd.store(there + plane, HALF * (c - b))
+            transform_back(at, side, turns)
+            for angle in range(side):
+                simd.store(at_polar + _STEP * (angle * fields + one), simd.load(at + _STEP * angle))
+                simd.store(at_polar + _STEP * (angle * fields + two), simd.load(at + plane + _STEP * angle))
+        for node in range(nodes):
+            simd.store(at_result + node * stride + lens, _sum_entries(start, column, share, node, at_polar, _STEP))
+    return rows.keep_alive((strip, polar))
+
+
+@inline
+def _load_rows(at, step, skip):
+    """Eight rows of sixteen numbers, the first of which are skipped."""
+    return (
+        simd.load(at) if skip < 1 else simd.zeros(),
+        simd.load(at + step) if skip < 2 else simd.zeros(),
+        simd.load(at + 2 * step) if skip < 3 else simd.zeros(),
+        simd.load(at + 3 * step) if skip < 4 else simd.zeros(),
+        simd.load(at + 4 * step) if skip < 5 else simd.zeros(),
+        simd.load(at + 5 * step) if skip < 6 else simd.zeros(),
+        simd.load(at + 6 * step) if skip < 7 else simd.zeros(),
+        simd.load(at + 7 * step),
+    )
+
+
+@inline
+def _store_rows(at, step, values):
+    a, b, c, d, e, f, g, h = values
+    simd.store(at, a)
+    simd.store(at + step, b)
+    simd.store(at + 2 * step, c)
+    simd.store(at + 3 * step, d)
+    simd.store(at + 4 * step, e)
+    simd.store(at + 5 * step, f)
+    simd.store(at + 6 * step, g)
+    simd.store(at + 7 * step, h)
+
+
+@inline
+def _add_scaled(values, at, x):
+    """Add `x` to each of eight rows, times the number at `at` for it."""
+    a, b, c, d, e, f, g, h = values
+    a, b = a + simd.load_one(at) * x, b + simd.load_one(at + 4) * x
+    c, d = c + simd.load_one(at + 8) * x, d + simd.load_one(at + 12) * x
+    e, f = e + simd.load_one(at + 16) * x, f + simd.load_one(at + 20) * x
+    g, h = g + simd.load_one(at + 24) * x, h + simd.load_one(at + 28) * x
+    return a, b, c, d, e, f, g, h
+
+
+@inline
+def _sum_scaled(values, at):
+    """The sum of eight rows, each times its number at `at`."""
+    a, b, c, d, e, f, g, h = values
+    first = simd.load_one(at) * a + simd.load_one(at + 4) * b + simd.load_one(at + 8) * c + simd.load_one(at + 12) * d
+    last = (
+        simd.load_one(at + 16) * e
+        + simd.load_one(at + 20) * f
+        + simd.load_one(at + 24) * g
+        + simd.load_one(at + 28) * h
+    )
+    return first + last
+
+
+@inline
+def _list_nonzero(job, harmonic, row, listed):
+    """Write the columns of a block of a harmonic's table that are not zero to a list; returns how many."""
+    count, columns, radii = 0, rows.size(job, 0, 1), rows.size(job, 0, 2)
+    for number in range(columns):
+        at = rows.address(job, 0) + 4 * ((harmonic * columns + number) * radii + row)
+        bits = carray(simd.pointer(at), ROWS // 2, np.int64)
+        listed[count] = number
+        if bits[0] | bits[1] | bits[2] | bits[3] != 0:
+            count += 1
+    return count
+
+
+def add_products(job_address, part, _):
+    """Add each harmonic's products with its table `(order field, radius)` to a sum; a part is some harmonics."""
+    job = rows.job_at(job_address)
+    harmonics, columns, radii = rows.shape(job, 0)
+    fields, stride = columns // 2, 4 * rows.size(job, 3, 2)
+    listed = np.empty(columns + 1, np.int64)
+    for harmonic in range(part * harmonics // job[PARTS], (part + 1) * harmonics // job[PARTS]):
+        at_x = rows.address(job, 3) + 2 * harmonic * fields * stride
+        for block in range(0, radii, ROWS):
+            # The last block may begin earlier, and computes some rows again.
+            row = min(block, radii - ROWS)
+            count = _list_nonzero(job, harmonic, row, listed)
+            at_table = rows.address(job, 0) + 4 * (harmonic * columns * radii + row)
+            at_sums = (2 * harmonic * radii + row) * stride
+            for lens in range(0, stride, _STEP):
+                excess, at = simd.load(rows.address(job, 1) + lens), rows.address(job, 2) + at_sums + lens
+                real, imaginary = _load_rows(at, stride, 0), _load_rows(at + radii * stride, stride, 0)
+                for number in range(count):
+                    field = listed[number]
+                    at_field = at_x + (field if field < fields else field - fields) * stride + lens
+                    x, y = simd.load(at_field), simd.load(at_field + fields * stride)
+                    if field >= fields:
+                        x, y = x * excess, y * excess
+                    real = _add_scaled(real, at_table + 4 * field * radii, x)
+                    imaginary = _add_scaled(imaginary, at_table + 4 * field * radii, y)
+                at = rows.address(job, 4) + at_sums + lens
+                _store_rows(at, stride, real)
+                _store_rows(at + radii * stride, stride, imaginary)
+    listed[0] = 0
+    return rows.DONE
+
+
+def products_back(job_address, part, _):
+    """The adjoint of `add_products`; a part is some harmonics."""
+    job = rows.job_at(job_address)
+    harmonics, columns, radii = rows.shape(job, 0)
+    fields, stride = columns // 2, 4 * rows.size(job, 3, 2)
+    listed = np.empty(columns + 1, np.int64)
+    result = rows.floats(job, 3)
+    for harmonic in range(part * harmonics // job[PARTS], (part + 1) * harmonics // job[PARTS]):
+        at_x = rows.address(job, 3) + 2 * harmonic * fields * stride
+        result[2 * harmonic : 2 * harmonic + 2] = ZERO
+        for block in range(0, radii, ROWS):
+            row = min(block, radii - ROWS)
+            count = _list_nonzero(job, harmonic, row, listed)
+            at_table = rows.address(job, 0) + 4 * (harmonic * columns * radii + row)
+            for lens in range(0, stride, _STEP):
+                excess = simd.load(rows.address(job, 1) + lens)
+                at = rows.address(job, 2) + (2 * harmonic * radii + row) * stride + lens
+                # Without the rows that the block before had.
+                real = _load_rows(at, stride, block - row)
+                imaginary = _load_rows(at + radii * stride, stride, block - row)
+                for number in range(count):
+                    field = listed[number]
+                    at_field = at_x + (field if field < fields else field - fields) * stride + lens
+                    x = _sum_scaled(real, at_table + 4 * field * radii)
+                    y = _sum_scaled(imaginary, at_table + 4 * field * radii)
+                    if field >= fields:
+                        x, y = x * excess, y * excess
+                    simd.store(at_field, simd.load(at_field) + x)
+                    simd.store(at_field + fields * stride, simd.load(at_field + fields * stride) + y)
+    listed[0] = 0
+    return rows.DONE
