@@ -22,7 +22,7 @@ from ..base.workers import map_in_threads
 from ..geometry import Imager
 from ..linear.sparse_table import SparseTable
 from .apertures import clear_area
-from .polar_grid import PolarGrid, make_polar_grid, polar_weights, to_pixels_table, to_polar_table
+from .polar_grid import RADII, PolarGrid, make_polar_grid, polar_weights, to_pixels_table, to_polar_table
 from .psf_core import (
     HARMONICS,
     RINGS,
@@ -55,9 +55,9 @@ _PLAIN = 3
 _SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
 # Order of the low-pass filter of angular harmonics, which ends where a wave is two pixels.
 _FILTER_ORDER = 8
-# Part of the stray light's root mean square that its tables leave out, in blocks of so many radii, but not of the first
-# harmonics, which hold the light. Its change with the clear area counts as for lenses that differ by this part or more.
-_LEFT_OUT, _BLOCK, _WHOLE, _LEAST_SPREAD = 0.005, 8, 4, 0.1
+# Part of the stray light's root mean square that its tables leave out, but not of the first harmonics, which hold the
+# light. Its change with the clear area counts as for lenses that differ by this part or more.
+_LEFT_OUT, _WHOLE, _LEAST_SPREAD = 0.005, 4, 0.1
 # Rays of each field, and samples of a core.
 _RAYS, _CORE_SAMPLES = 16384, 2048
 
@@ -69,7 +69,7 @@ class StrayLight(eqx.Module):
     the tables, `v'`, mm. `to_polar`, `to_pixels`: between square and polar nodes. `grid`: the nodes.
     """
 
-    table: Float[Array, "depth harmonic order field radius"]
+    table: Float[Array, "depth harmonic block order field radius"]
     area: Float[Array, ""]
     sensor_distance: Float[Array, ""]
     to_polar: SparseTable
@@ -246,12 +246,12 @@ def stray_light_table(
     grid: PolarGrid,
     cores: PsfCores,
     ends: Sequence[float] = RINGS,
-) -> Float32[np.ndarray, "harmonic order field radius"]:
+) -> Float32[np.ndarray, "harmonic block order field radius"]:
     """Maps each harmonic of the object over the fields to the image's over the radii, at one depth.
 
     Order 0 is the mean lens, less its cores; order 1 its change with the clear area, 1/mm^2. The image is the adjoint
     of the Fourier transform of these harmonics. What is far from a field's core or smooth is zero in most harmonics:
-    numbers that together have `_LEFT_OUT` of the light's root mean square are left out.
+    blocks of `RADII` numbers that together have `_LEFT_OUT` of the light's root mean square are left out.
     """
     fields = grid.step * grid.nodes(grid.fields)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS), aperture)
@@ -281,22 +281,16 @@ def stray_light_table(
     count = np.full(spectra.shape[-1], 2.0)
     count[[0, -1]] = 1
     table = (spectra * (count / grid.angles * (-1.0) ** np.arange(len(count)))).transpose(3, 0, 1, 2)
-    areas = np.asarray(clear_area(imager.array))
-    spread = max(np.std(areas), _LEAST_SPREAD * np.mean(areas))
-    energy = table**2 * np.multiply.outer([1, spread**2], np.outer(grid.areas(grid.fields), 1 / grid.areas(grid.radii)))
-    return (table * _strongest_blocks(energy * count[:, None, None, None])).astype(np.float32)
-
-
-def _strongest_blocks(energy):
-    """Which blocks of radii, of all harmonics but the first few, have all but a negligible part of the energy."""
-    radii = energy.shape[-1]
-    padded = np.pad(energy, [(0, 0)] * 3 + [(0, -radii % _BLOCK)])
-    blocks = padded.reshape(*energy.shape[:-1], -1, _BLOCK).sum(-1)
-    ascending = np.sort(blocks, None)
-    number = np.searchsorted(np.cumsum(ascending), _LEFT_OUT**2 * ascending.sum())
-    kept = blocks > ascending[max(number - 1, 0)] if number else np.ones(blocks.shape, bool)
+    table = table.reshape(*table.shape[:3], -1, RADII)  # harmonic, order, field, block, radius
+    clear = np.asarray(clear_area(imager.array))
+    spread = max(np.std(clear), _LEAST_SPREAD * np.mean(clear))
+    areas = grid.areas(grid.radii).reshape(-1, RADII)
+    energy = np.einsum("h,hofbr,o,f,br->hofb", 1 / count, table**2, [1, spread**2], grid.areas(grid.fields), 1 / areas)
+    ascending = np.sort(energy, None)
+    few = np.searchsorted(np.cumsum(ascending), _LEFT_OUT**2 * ascending.sum())
+    kept = energy >= ascending[min(few, ascending.size - 1)]
     kept[:_WHOLE] = True
-    return np.repeat(kept, _BLOCK, -1)[..., :radii]
+    return (table * kept[..., None]).transpose(0, 3, 1, 2, 4).astype(np.float32)
 
 
 def _bin_polar(grid, landing, light):

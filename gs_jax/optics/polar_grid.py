@@ -24,8 +24,8 @@ _LINEAR, _NODES = 0.45, 44
 _BEYOND = 0.35
 # Nodes around may be wider apart than outward by so much, so that their number is a power of two or three times one.
 _WIDER = 1.1
-# Kernels compute so many radii at once.
-_LEAST_RADII = 8
+# Tables and kernels have so many radii at once.
+RADII = 8
 # Inner rings of polar nodes, which are closer to each other than pixels.
 _INNER_RINGS = 4
 
@@ -76,7 +76,7 @@ def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, ex
     bend = linear / step
     count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
     largest = float(imager.magnification(float(depths.min()))) / middle
-    radii = max(count((1 + _BEYOND) * largest * widest / step), _LEAST_RADII)
+    radii = math.ceil(count((1 + _BEYOND) * largest * widest / step) / RADII) * RADII
     around = math.log2(2 * math.pi * bend / _WIDER)
     angles = min(2 ** math.ceil(around), 3 * 2 ** math.ceil(around - math.log2(3)))
     return PolarGrid(step, pixel, bend, angles, count(widest / step), radii)

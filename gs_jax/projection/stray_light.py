@@ -22,8 +22,8 @@ from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
 from .cpu.loading import kernels
 
-# Lenses whose stray light is computed at once, which bounds the memory.
-_LENSES = 112
+# Lenses whose stray light is computed at once: few stay in a CPU's cache, many keep an accelerator busy.
+_LENSES, _LENSES_ON_CPU = 112, 32
 # Kernels take sixteen lenses at once, and read so many pixels beyond a window.
 _SPARE = 16
 # Linear interpolations blur the stray light by about this variance, in squared pixels. A Wiener filter undoes that
@@ -55,20 +55,21 @@ def stray_light_image(
     axes, image_of_axis = imager.axis_offset(depths).astype(dtype), imager.image_of_axis.astype(dtype)
     # One matrix for both orders.
     table = optics.table.astype(dtype)
-    table = table.reshape(*table.shape[:2], -1, table.shape[-1])
+    table = table.reshape(*table.shape[:3], -1, table.shape[-1])
 
     def add_lenses(image, lenses):
         centers, excess = lenses
 
         def add_depth(spectra, plane):
-            nodes, table, axis = plane
+            depth, nodes, axis = plane
             places = _window_places(centers + axis[None], origin.astype(dtype), polar_grid.step, nodes.shape, inner)
             objects = interpolate_windows(Windows(nodes.shape, inner), places, nodes).reshape(-1, len(centers))
             fields = angular_spectra(polar_grid.angles, optics.to_polar, objects)
-            return add_products((), (table, excess), (spectra, fields)), None
+            return add_products((), (table, depth, excess), (spectra, fields)), None
 
         dark = jnp.zeros((2 * table.shape[1], polar_grid.radii, len(centers)), dtype)
-        spectra = lax.scan(jax.checkpoint(add_depth), dark, (nodes, table, axes))[0]
+        planes = jnp.arange(len(table), dtype=jnp.int32), nodes, axes
+        spectra = lax.scan(jax.checkpoint(add_depth), dark, planes)[0]
         spots = angular_spectra.T(polar_grid.angles, optics.to_pixels.T, spectra).reshape(outer, outer, -1)
         middle = jnp.asarray(imager.sensor.origin, dtype)
         places = _window_places(centers + image_of_axis[None], middle, pixel, image.shape, outer)
@@ -86,13 +87,13 @@ def stray_light_image(
 
 
 def _lens_groups(imager, optics, dtype):
-    """Centres and excess areas of lenses, at most `_LENSES` a group; the last are filled up with lenses far away.
+    """Centres and excess areas of groups of lenses, which are filled up with lenses far away.
 
     They are in the order of their rows: kernels read windows that are near each other at once.
     """
     centers, excess = imager.centers.astype(dtype), clear_area(imager.array).astype(dtype) - optics.area.astype(dtype)
     order, count = jnp.argsort(centers[:, 1]), len(excess)
-    groups = -(-count // _LENSES)
+    groups = -(-count // (_LENSES_ON_CPU if jax.default_backend() == "cpu" else _LENSES))
     size = -(-count // (groups * _SPARE)) * _SPARE
     missing = groups * size - count
     centers = jnp.pad(centers[order], [(0, missing), (0, 0)], constant_values=1e6)
@@ -221,18 +222,19 @@ angular_spectra = LinearMap(_to_spectra, _from_spectra, kernels=kernels("to_spec
 
 
 def _add_products(_, constants, parts):
-    (table, excess), (total, x) = constants, parts
-    x = x.reshape(len(table), 2, -1, x.shape[-1])
-    products = jnp.einsum("hfr,hcfl->hcrl", table, jnp.concatenate([x, excess * x], 2))
+    (table, depth, excess), (total, x) = constants, parts
+    x = x.reshape(table.shape[1], 2, -1, x.shape[-1])
+    products = jnp.einsum("hbfr,hcfl->hcbrl", table[depth], jnp.concatenate([x, excess * x], 2))
     return total + products.reshape(total.shape)
 
 
 def _products_back(_, constants, y):
-    table, excess = constants
-    x = jnp.einsum("hfr,hcrl->hcfl", table, y.reshape(len(table), 2, -1, y.shape[-1]))
+    table, depth, excess = constants
+    image = y.reshape(table.shape[1], 2, table.shape[2], table.shape[4], -1)
+    x = jnp.einsum("hbfr,hcbrl->hcfl", table[depth], image)
     mean, change = jnp.split(x, 2, 2)
     return y, (mean + excess * change).reshape(len(y), -1, y.shape[-1])
 
 
-# `((), (table, excess), (total, x))`: a sum, and each harmonic's product with its table `(order field, radius)`.
+# `((), (table, depth, excess), (total, x))`: a sum, and each harmonic's product with its table at this depth.
 add_products = LinearMap(_add_products, _products_back, kernels=kernels("add_products", "products_back"))

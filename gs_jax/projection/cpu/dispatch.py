@@ -273,24 +273,25 @@ def _of_angles(kernel, angles, entries, fit, shape, x):
 
 
 def add_products(_, constants, parts):
-    (table, excess), (total, x) = constants, parts
-    arrays = [table, *map(_whole_last_axis, (excess, total, x))]
-    _require_products("add_products", *arrays)
-    return _call("add_products", ShapeDtypeStruct(arrays[2].shape, jnp.float32), *arrays)[..., : len(excess)]
+    (table, depth, excess), (total, x) = constants, map(_whole_last_axis, parts)
+    tables = _product_tables("add_products", table, depth, excess, total, x)
+    return _call("add_products", ShapeDtypeStruct(total.shape, jnp.float32), *tables, total, x)[..., : len(excess)]
 
 
 def products_back(_, constants, y):
-    (table, excess), whole = constants, _whole_last_axis(y)
-    shape = len(y), table.shape[1] // 2, whole.shape[2]
-    arrays = table, _whole_last_axis(excess), whole
-    _require_products("products_back", *arrays, ShapeDtypeStruct(shape, jnp.float32))
-    return y, _call("products_back", ShapeDtypeStruct(shape, jnp.float32), *arrays)[..., : len(excess)]
+    (table, depth, excess), whole = constants, _whole_last_axis(y)
+    result = ShapeDtypeStruct((len(y), table.shape[3] // 2, whole.shape[2]), jnp.float32)
+    tables = _product_tables("products_back", table, depth, excess, whole, result)
+    return y, _call("products_back", result, *tables, whole)[..., : len(excess)]
 
 
-def _require_products(kernel, table, excess, image, x):
-    harmonics, twice, radii = table.shape
-    fit = image.shape == (2 * harmonics, radii, len(excess)) and x.shape == (2 * harmonics, twice // 2, len(excess))
-    _require(kernel, fit and radii >= spectra.ROWS, table, excess, image, x)
+def _product_tables(kernel, table, depth, excess, image, x):
+    (_, harmonics, blocks, columns, radii), excess = table.shape, _whole_last_axis(excess)
+    fit = image.shape == (2 * harmonics, blocks * radii, len(excess)) and radii == spectra.ROWS
+    fit = fit and x.shape == (2 * harmonics, columns // 2, len(excess)) and depth.dtype == jnp.int32
+    _require(kernel, fit and depth.ndim == 0, table, excess, image, x)
+    # The depth chooses rows of the table, which must exist.
+    return table.reshape(-1, columns, radii), jnp.clip(depth, 0, len(table) - 1), excess
 
 
 @cache

@@ -7,6 +7,7 @@ once, as the real and the imaginary part of one complex sequence.
 
 import numpy as np
 
+from ...optics.polar_grid import RADII
 from . import rows, simd
 from .fftconv import plane_bytes, transform, transform_back
 from .gather import align, scratch
@@ -15,8 +16,8 @@ from .simd import WIDTH, carray, inline
 
 # Bytes of sixteen numbers.
 _STEP = 4 * WIDTH
-# Radii at once; a table's zeros are skipped in blocks of so many.
-ROWS = 8
+# Radii at once: a table's blocks have as many, and those that are zero are skipped.
+ROWS = RADII
 
 
 @inline
@@ -97,18 +98,11 @@ def from_spectra(job_address, part, _):
 
 
 @inline
-def _load_rows(at, step, skip):
-    """Eight rows of sixteen numbers, the first of which are skipped."""
-    return (
-        simd.load(at) if skip < 1 else simd.zeros(),
-        simd.load(at + step) if skip < 2 else simd.zeros(),
-        simd.load(at + 2 * step) if skip < 3 else simd.zeros(),
-        simd.load(at + 3 * step) if skip < 4 else simd.zeros(),
-        simd.load(at + 4 * step) if skip < 5 else simd.zeros(),
-        simd.load(at + 5 * step) if skip < 6 else simd.zeros(),
-        simd.load(at + 6 * step) if skip < 7 else simd.zeros(),
-        simd.load(at + 7 * step),
-    )
+def _load_rows(at, step):
+    """Eight rows of sixteen numbers."""
+    a, b, c, d = simd.load(at), simd.load(at + step), simd.load(at + 2 * step), simd.load(at + 3 * step)
+    at = at + 4 * step
+    return a, b, c, d, simd.load(at), simd.load(at + step), simd.load(at + 2 * step), simd.load(at + 3 * step)
 
 
 @inline
@@ -150,44 +144,42 @@ def _sum_scaled(values, at):
 
 
 @inline
-def _list_nonzero(job, harmonic, row, listed):
-    """Write the columns of a block of a harmonic's table that are not zero to a list; returns how many."""
-    count, columns, radii = 0, rows.size(job, 0, 1), rows.size(job, 0, 2)
-    for number in range(columns):
-        at = rows.address(job, 0) + 4 * ((harmonic * columns + number) * radii + row)
-        bits = carray(simd.pointer(at), ROWS // 2, np.int64)
-        listed[count] = number
+def _list_nonzero(at, columns, listed):
+    """Write the columns of a block that are not zero to a list; returns how many."""
+    count = 0
+    for column in range(columns):
+        bits = carray(simd.pointer(at + 4 * ROWS * column), ROWS // 2, np.int64)
+        listed[count] = column
         if bits[0] | bits[1] | bits[2] | bits[3] != 0:
             count += 1
     return count
 
 
 def add_products(job_address, part, _):
-    """Add each harmonic's products with its table `(order field, radius)` to a sum; a part is some harmonics."""
+    """Add each harmonic's products with its table to a sum; a part is some harmonics."""
     job = rows.job_at(job_address)
-    harmonics, columns, radii = rows.shape(job, 0)
-    fields, stride = columns // 2, 4 * rows.size(job, 3, 2)
+    harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
+    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(rows.integers(job, 1)[0, 0, 0])
     listed = np.empty(columns + 1, np.int64)
     for harmonic in range(part * harmonics // job[PARTS], (part + 1) * harmonics // job[PARTS]):
-        at_x = rows.address(job, 3) + 2 * harmonic * fields * stride
-        for block in range(0, radii, ROWS):
-            # The last block may begin earlier, and computes some rows again.
-            row = min(block, radii - ROWS)
-            count = _list_nonzero(job, harmonic, row, listed)
-            at_table = rows.address(job, 0) + 4 * (harmonic * columns * radii + row)
+        at_x = rows.address(job, 4) + 2 * harmonic * fields * stride
+        for row in range(0, radii, ROWS):
+            block = ((depth * harmonics + harmonic) * radii + row) // ROWS
+            at_table = rows.address(job, 0) + 4 * ROWS * block * columns
+            count = _list_nonzero(at_table, columns, listed)
             at_sums = (2 * harmonic * radii + row) * stride
             for lens in range(0, stride, _STEP):
-                excess, at = simd.load(rows.address(job, 1) + lens), rows.address(job, 2) + at_sums + lens
-                real, imaginary = _load_rows(at, stride, 0), _load_rows(at + radii * stride, stride, 0)
+                excess, at = simd.load(rows.address(job, 2) + lens), rows.address(job, 3) + at_sums + lens
+                real, imaginary = _load_rows(at, stride), _load_rows(at + radii * stride, stride)
                 for number in range(count):
-                    field = listed[number]
-                    at_field = at_x + (field if field < fields else field - fields) * stride + lens
+                    column = listed[number]
+                    at_field = at_x + (column if column < fields else column - fields) * stride + lens
                     x, y = simd.load(at_field), simd.load(at_field + fields * stride)
-                    if field >= fields:
+                    if column >= fields:
                         x, y = x * excess, y * excess
-                    real = _add_scaled(real, at_table + 4 * field * radii, x)
-                    imaginary = _add_scaled(imaginary, at_table + 4 * field * radii, y)
-                at = rows.address(job, 4) + at_sums + lens
+                    real = _add_scaled(real, at_table + 4 * ROWS * column, x)
+                    imaginary = _add_scaled(imaginary, at_table + 4 * ROWS * column, y)
+                at = rows.address(job, 5) + at_sums + lens
                 _store_rows(at, stride, real)
                 _store_rows(at + radii * stride, stride, imaginary)
     listed[0] = 0
@@ -197,29 +189,26 @@ def add_products(job_address, part, _):
 def products_back(job_address, part, _):
     """The adjoint of `add_products`; a part is some harmonics."""
     job = rows.job_at(job_address)
-    harmonics, columns, radii = rows.shape(job, 0)
-    fields, stride = columns // 2, 4 * rows.size(job, 3, 2)
-    listed = np.empty(columns + 1, np.int64)
-    result = rows.floats(job, 3)
+    harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
+    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(rows.integers(job, 1)[0, 0, 0])
+    listed, result = np.empty(columns + 1, np.int64), rows.floats(job, 4)
     for harmonic in range(part * harmonics // job[PARTS], (part + 1) * harmonics // job[PARTS]):
-        at_x = rows.address(job, 3) + 2 * harmonic * fields * stride
+        at_x = rows.address(job, 4) + 2 * harmonic * fields * stride
         result[2 * harmonic : 2 * harmonic + 2] = ZERO
-        for block in range(0, radii, ROWS):
-            row = min(block, radii - ROWS)
-            count = _list_nonzero(job, harmonic, row, listed)
-            at_table = rows.address(job, 0) + 4 * (harmonic * columns * radii + row)
+        for row in range(0, radii, ROWS):
+            block = ((depth * harmonics + harmonic) * radii + row) // ROWS
+            at_table = rows.address(job, 0) + 4 * ROWS * block * columns
+            count = _list_nonzero(at_table, columns, listed)
             for lens in range(0, stride, _STEP):
-                excess = simd.load(rows.address(job, 1) + lens)
-                at = rows.address(job, 2) + (2 * harmonic * radii + row) * stride + lens
-                # Without the rows that the block before had.
-                real = _load_rows(at, stride, block - row)
-                imaginary = _load_rows(at + radii * stride, stride, block - row)
+                excess = simd.load(rows.address(job, 2) + lens)
+                at = rows.address(job, 3) + (2 * harmonic * radii + row) * stride + lens
+                real, imaginary = _load_rows(at, stride), _load_rows(at + radii * stride, stride)
                 for number in range(count):
-                    field = listed[number]
-                    at_field = at_x + (field if field < fields else field - fields) * stride + lens
-                    x = _sum_scaled(real, at_table + 4 * field * radii)
-                    y = _sum_scaled(imaginary, at_table + 4 * field * radii)
-                    if field >= fields:
+                    column = listed[number]
+                    at_field = at_x + (column if column < fields else column - fields) * stride + lens
+                    x = _sum_scaled(real, at_table + 4 * ROWS * column)
+                    y = _sum_scaled(imaginary, at_table + 4 * ROWS * column)
+                    if column >= fields:
                         x, y = x * excess, y * excess
                     simd.store(at_field, simd.load(at_field) + x)
                     simd.store(at_field + fields * stride, simd.load(at_field + fields * stride) + y)
