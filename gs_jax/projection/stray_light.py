@@ -224,7 +224,7 @@ angular_spectra = LinearMap(_to_spectra, _from_spectra, kernels=kernels("to_spec
 def _add_products(_, constants, parts):
     (table, depth, excess), (total, x) = constants, parts
     x = x.reshape(table.shape[1], 2, -1, x.shape[-1])
-    products = jnp.einsum("hbfr,hcfl->hcbrl", table[depth], jnp.concatenate([x, excess * x], 2))
+    products = jnp.einsum("hbfr,hcfl->hcbrl", table[depth], jnp.concatenate([x, excess[None, None, None] * x], 2))
     return total + products.reshape(total.shape)
 
 
@@ -233,7 +233,7 @@ def _products_back(_, constants, y):
     image = y.reshape(table.shape[1], 2, table.shape[2], table.shape[4], -1)
     x = jnp.einsum("hbfr,hcbrl->hcfl", table[depth], image)
     mean, change = jnp.split(x, 2, 2)
-    return y, (mean + excess * change).reshape(len(y), -1, y.shape[-1])
+    return y, (mean + excess[None, None, None] * change).reshape(len(y), -1, y.shape[-1])
 
 
 # `((), (table, depth, excess), (total, x))`: a sum, and each harmonic's product with its table at this depth.
