@@ -12,7 +12,7 @@ from . import rows, simd
 from .fftconv import plane_bytes, transform, transform_back
 from .gather import align, scratch
 from .rows import HALF, PARTS, ZERO
-from .simd import WIDTH, carray, inline
+from .simd import WIDTH, inline
 
 # Bytes of sixteen numbers.
 _STEP = 4 * WIDTH
@@ -144,15 +144,16 @@ def _sum_scaled(values, at):
 
 
 @inline
-def _list_nonzero(at, columns, listed):
-    """Write the columns of a block that are not zero to a list; returns how many."""
-    count = 0
-    for column in range(columns):
-        bits = carray(simd.pointer(at + 4 * ROWS * column), ROWS // 2, np.int64)
-        listed[count] = column
-        if bits[0] | bits[1] | bits[2] | bits[3] != 0:
-            count += 1
-    return count
+def _list_nonzero(at, fields, listed):
+    """Write the columns of a block that are not zero to a list; returns how many, of the mean lens and in all."""
+    mean, count = 0, 0
+    for column in range(0, 2 * fields, 2):
+        # Two columns are sixteen numbers.
+        if simd.any_nonzero(simd.load(at + 4 * ROWS * column)):
+            listed[count], listed[count + 1] = column, column + 1
+            count += 2
+            mean += 2 if column + 1 < fields else 1 if column < fields else 0
+    return mean, count
 
 
 def add_products(job_address, part, _):
@@ -166,22 +167,21 @@ def add_products(job_address, part, _):
         for row in range(0, radii, ROWS):
             block = ((depth * harmonics + harmonic) * radii + row) // ROWS
             at_table = rows.address(job, 0) + 4 * ROWS * block * columns
-            count = _list_nonzero(at_table, columns, listed)
+            mean, count = _list_nonzero(at_table, fields, listed)
             at_sums = (2 * harmonic * radii + row) * stride
             for lens in range(0, stride, _STEP):
-                excess, at = simd.load(rows.address(job, 2) + lens), rows.address(job, 3) + at_sums + lens
-                real, imaginary = _load_rows(at, stride), _load_rows(at + radii * stride, stride)
-                for number in range(count):
-                    column = listed[number]
-                    at_field = at_x + (column if column < fields else column - fields) * stride + lens
-                    x, y = simd.load(at_field), simd.load(at_field + fields * stride)
-                    if column >= fields:
-                        x, y = x * excess, y * excess
-                    real = _add_scaled(real, at_table + 4 * ROWS * column, x)
-                    imaginary = _add_scaled(imaginary, at_table + 4 * ROWS * column, y)
-                at = rows.address(job, 5) + at_sums + lens
-                _store_rows(at, stride, real)
-                _store_rows(at + radii * stride, stride, imaginary)
+                excess = simd.load(rows.address(job, 2) + lens)
+                for part_of in range(2):
+                    at = at_sums + part_of * radii * stride + lens
+                    values = _load_rows(rows.address(job, 3) + at, stride)
+                    at_part = at_x + part_of * fields * stride + lens
+                    for number in range(mean):
+                        x = simd.load(at_part + listed[number] * stride)
+                        values = _add_scaled(values, at_table + 4 * ROWS * listed[number], x)
+                    for number in range(mean, count):
+                        x = excess * simd.load(at_part + (listed[number] - fields) * stride)
+                        values = _add_scaled(values, at_table + 4 * ROWS * listed[number], x)
+                    _store_rows(rows.address(job, 5) + at, stride, values)
     listed[0] = 0
     return rows.DONE
 
@@ -198,19 +198,21 @@ def products_back(job_address, part, _):
         for row in range(0, radii, ROWS):
             block = ((depth * harmonics + harmonic) * radii + row) // ROWS
             at_table = rows.address(job, 0) + 4 * ROWS * block * columns
-            count = _list_nonzero(at_table, columns, listed)
+            mean, count = _list_nonzero(at_table, fields, listed)
+            if count == 0:
+                continue
             for lens in range(0, stride, _STEP):
                 excess = simd.load(rows.address(job, 2) + lens)
-                at = rows.address(job, 3) + (2 * harmonic * radii + row) * stride + lens
-                real, imaginary = _load_rows(at, stride), _load_rows(at + radii * stride, stride)
-                for number in range(count):
-                    column = listed[number]
-                    at_field = at_x + (column if column < fields else column - fields) * stride + lens
-                    x = _sum_scaled(real, at_table + 4 * ROWS * column)
-                    y = _sum_scaled(imaginary, at_table + 4 * ROWS * column)
-                    if column >= fields:
-                        x, y = x * excess, y * excess
-                    simd.store(at_field, simd.load(at_field) + x)
-                    simd.store(at_field + fields * stride, simd.load(at_field + fields * stride) + y)
+                for part_of in range(2):
+                    at = rows.address(job, 3) + ((2 * harmonic + part_of) * radii + row) * stride + lens
+                    values, at_part = _load_rows(at, stride), at_x + part_of * fields * stride + lens
+                    for number in range(mean):
+                        at = at_part + listed[number] * stride
+                        x = _sum_scaled(values, at_table + 4 * ROWS * listed[number])
+                        simd.store(at, simd.load(at) + x)
+                    for number in range(mean, count):
+                        at = at_part + (listed[number] - fields) * stride
+                        x = _sum_scaled(values, at_table + 4 * ROWS * listed[number])
+                        simd.store(at, simd.load(at) + excess * x)
     listed[0] = 0
     return rows.DONE
