@@ -285,7 +285,8 @@ def stray_light_table(
     clear = np.asarray(clear_area(imager.array))
     spread = max(np.std(clear), _LEAST_SPREAD * np.mean(clear))
     areas = grid.areas(grid.radii).reshape(-1, RADII)
-    energy = np.einsum("h,hofbr,o,f,br->hofb", 1 / count, table**2, [1, spread**2], grid.areas(grid.fields), 1 / areas)
+    orders, fields = np.array([1, spread**2]), grid.areas(grid.fields)
+    energy = np.einsum("h,hofbr,o,f,br->hofb", 1 / count, table**2, orders, fields, 1 / areas)
     ascending = np.sort(energy, None)
     few = np.searchsorted(np.cumsum(ascending), _LEFT_OUT**2 * ascending.sum())
     kept = energy >= ascending[min(few, ascending.size - 1)]
