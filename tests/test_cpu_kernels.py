@@ -22,7 +22,7 @@ from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
 from gs_jax.projection.cpu import loading
 from gs_jax.projection.rays import OUTSIDE, Envelope, RingLight
-from gs_jax.projection.stray_light import Windows, interpolate_windows, times_table
+from gs_jax.projection.stray_light import Windows, add_products, angular_spectra, interpolate_windows
 
 from .helpers import scene, trace_rays
 
@@ -115,30 +115,48 @@ def same(results, expected):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * np.abs(b).max())
 
 
-def windows_and_tables(windows, places, image, values, table, x, y):
+# Angles around a lens: powers of two, and three times such.
+ANGLES = (16, 24)
+
+
+def maps_of_stray_light(windows, places, image, values, tables, x, y, constants, parts, z):
     read, added = interpolate_windows(windows, places, image), interpolate_windows.T(windows, places, values)
-    return read, added, times_table((), table, x), times_table.T((), table, y)
+    spectra = [angular_spectra(n, table, x) for n, table in zip(ANGLES, tables, strict=True)]
+    back = [angular_spectra.T(n, table, own) for n, table, own in zip(ANGLES, tables, y, strict=True)]
+    sums, products = add_products((), constants, parts), add_products.T((), constants, z)[1]
+    return read, added, *spectra, *back, sums, products
 
 
-def test_windows_and_sparse_tables_are_those_of_xla():
+def test_maps_of_stray_light_are_those_of_xla():
     rng = np.random.default_rng(0)
-    windows, lenses = Windows((61, 75), 19), 29  # no multiple of sixteen, as the columns of the tables below
+    windows, lenses = Windows((61, 75), 19), 29  # no multiple of sixteen
     # Some end beyond the image.
     start = rng.integers(-4, 30, (lenses, 2)).astype(np.int32)
     image = rng.random(windows.shape)
     values = rng.random((windows.side, windows.side, lenses))
-    row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), rng.random(400)
-    row[:60] = 7
-    table = SparseTable.of(0, row, column, share, (50, 90))
-    x, y = (rng.random((n, 75)) for n in (90, 50))
-    arrays = (start, rng.random((lenses, 2))), image, values, table, x, y
+    matrices, tables, y = [], [], []
+    for angles, fields in zip(ANGLES, (5, 4), strict=True):
+        row, column, share = rng.integers(0, angles * fields, 400), rng.integers(0, 90, 400), rng.random(400)
+        row[:60] = 7
+        tables.append(SparseTable.of(0, row, column, share, (angles * fields, 90)))
+        matrices.append(np.zeros((angles * fields, 90)))
+        np.add.at(matrices[-1], (row, column), share)
+        y.append(rng.random((angles + 2, fields, lenses)))
+    x, excess = rng.random((90, lenses)), rng.random(lenses)
+    table = rng.random((2, 3, 2, 10, 8)) * (rng.random((2, 3, 2, 10, 1)) > 0.7)
+    parts = rng.random((6, 16, lenses)), rng.random((6, 5, lenses))
+    constants = table, np.int32(1), excess
+    arrays = (start, rng.random((lenses, 2))), image, values, tables, x, y, constants, parts, rng.random(parts[0].shape)
     single = jax.tree.map(lambda a: a.astype(np.float32) if a.dtype == np.float64 else a, arrays)
-    same(run(windows_and_tables, windows, *single), expected := run(windows_and_tables, windows, *doubled(single)))
-    read, _, product, transposed = expected
-    matrix = np.zeros((50, 90))
-    np.add.at(matrix, (row, column), share)
-    np.testing.assert_allclose(product, matrix @ x, rtol=1e-5)
-    np.testing.assert_allclose(transposed, matrix.T @ y, rtol=1e-5)
+    same(run(maps_of_stray_light, windows, *single), expected := run(maps_of_stray_light, windows, *doubled(single)))
+    read, _, *spectra, _, _, sums, _ = expected
+    for angles, matrix, found in zip(ANGLES, matrices, spectra, strict=True):
+        spectrum = np.fft.rfft((matrix @ x).reshape(angles, -1, lenses), axis=0)
+        np.testing.assert_allclose(found[::2], spectrum.real, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(found[1::2], spectrum.imag, rtol=1e-5, atol=1e-5)
+    mean, change = np.split(table[1].transpose(0, 1, 3, 2).reshape(3, 16, 10), 2, -1)
+    imaginary = mean @ parts[1][1::2] + change @ (excess * parts[1][1::2])
+    np.testing.assert_allclose(sums[1::2] - parts[0][1::2], imaginary, rtol=1e-5, atol=1e-5)
     dark = ((start < 0) | (start + 20 > np.subtract(windows.shape, 16))).any(1)
     assert 0 < dark.sum() < lenses and not read[..., dark].any() and read[..., ~dark].all()
 
@@ -245,10 +263,13 @@ def run_all_guarded():
             places = rng.integers(-50, 90, (lenses, 2)).astype(np.int32), some(lenses, 2)
             dispatch.read_windows(windows, places, some(*windows.shape))
             dispatch.add_windows(windows, places, some(19, 19, lenses))
-            row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), some(400)
-            table = SparseTable.of(0, row, column, share, (50, 90))
-            dispatch.times_rows((), table, some(90, lenses))
-            dispatch.times_columns((), table, some(50, lenses))
+            row, column, share = rng.integers(0, 72, 400), rng.integers(0, 90, 400), some(400)
+            table = SparseTable.of(0, row, column, share, (72, 90))
+            dispatch.to_spectra(24, table, some(90, lenses))
+            dispatch.from_spectra(24, table, some(26, 3, lenses))
+            constants, total = (some(2, 3, 2, 10, 8), np.int32(1), some(lenses)), some(6, 16, lenses)
+            dispatch.add_products((), constants, (total, some(6, 5, lenses)))
+            dispatch.products_back((), constants, total)
         for size, shape in ((9, (61, 75)), (41, (150, 333))):
             for whole in (False, True):
                 change, (tall, wide) = size - 1 if whole else -size - 1, (n + size + 1 for n in shape)
@@ -269,14 +290,16 @@ def test_no_kernel_reads_or_writes_beyond_an_array():
 def test_sizes_that_do_not_fit_are_refused():
     shapes, rays, image, volume = problem(WEIGHTS[0])
     entries = np.array([0, 1]), np.array([0, 9]), np.ones(2)
-    table = SparseTable.of(0, *entries, (2, 10))
+    table = SparseTable.of(0, *entries, (4, 10))
     for call in (
         lambda: dispatch.gather(shapes, rays, image[:-1]),
         lambda: dispatch.scatter(shapes, rays, volume[:, :-1]),
         lambda: dispatch.rays_vjp(shapes, (rays, image), volume[:2]),
         lambda: dispatch.gather(shapes._replace(volume=(3, 5, 5)), rays, image),
         lambda: dispatch.gather(shapes, rays._replace(parameters=rays.parameters[:2]), image),
-        lambda: dispatch.times_rows((), table, np.ones((9, 16))),
+        lambda: dispatch.to_spectra(4, table, np.ones((9, 16))),
+        lambda: dispatch.from_spectra(5, table, np.ones((6, 1, 16))),
+        lambda: dispatch.products_back((), (np.ones((1, 3, 1, 2, 8)), np.int32(0), np.ones(4)), np.ones((6, 9, 4))),
         lambda: dispatch.read_windows(Windows((61, 75), 19), (np.zeros((3, 2)), np.zeros((2, 2))), image),
     ):
         with pytest.raises(ValueError, match="must fit each other"):

@@ -66,6 +66,11 @@ class SparseTable(eqx.Module):
         by_row, by_column = (row, column, share, (rows, columns)), (column, row, share, (columns, rows))
         return cls(side, Entries.by_row(*by_row), Entries.by_row(*by_column))
 
+    @property
+    def T(self) -> "SparseTable":
+        """The transpose."""
+        return SparseTable(self.side, self.columns, self.rows)
+
 
 def times_entries(entries: Entries, x: Float[Array, "column lens"]) -> Float[Array, "row lens"]:
     """The product with a dense matrix. Both directions gather whole rows: the scatter of a transpose is much slower."""

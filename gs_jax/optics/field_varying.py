@@ -52,6 +52,10 @@ _WIDEST = 0.9
 _LINEAR, _NODES = 0.45, 44
 # How far beyond the widest field's chief ray light is followed on the sensor, in images of the widest field.
 _BEYOND = 0.35
+# Nodes around may be wider apart than outward by so much, so that their number is a power of two or three times one.
+_WIDER = 1.1
+# Tables and kernels have so many radii at once.
+RADII = 8
 # Inner rings of polar nodes, which are closer to each other than pixels.
 _INNER_RINGS = 4
 
@@ -102,8 +106,10 @@ def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, ex
     bend = linear / step
     count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
     largest = float(imager.magnification(float(depths.min()))) / middle
-    radii = count((1 + _BEYOND) * largest * widest / step)
-    return PolarGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
+    radii = math.ceil(count((1 + _BEYOND) * largest * widest / step) / RADII) * RADII
+    around = math.log2(2 * math.pi * bend / _WIDER)
+    angles = min(2 ** math.ceil(around), 3 * 2 ** math.ceil(around - math.log2(3)))
+    return PolarGrid(step, pixel, bend, angles, count(widest / step), radii)
 
 
 def polar_weights(
@@ -200,6 +206,9 @@ _PLAIN = 3
 _SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
 # Order of the low-pass filter of angular harmonics, which ends where a wave is two pixels.
 _FILTER_ORDER = 8
+# Part of the stray light's root mean square that its tables leave out, but not of the first harmonics, which hold the
+# light. Its change with the clear area counts as for lenses that differ by this part or more.
+_LEFT_OUT, _WHOLE, _LEAST_SPREAD = 0.005, 4, 0.1
 # Rays of each field, and samples of a core.
 _RAYS, _CORE_SAMPLES = 16384, 2048
 
@@ -211,7 +220,7 @@ class StrayLight(eqx.Module):
     the tables, `v'`, mm. `to_polar`, `to_pixels`: between square and polar nodes. `grid`: the nodes.
     """
 
-    table: Float[Array, "depth harmonic radius order field"]
+    table: Float[Array, "depth harmonic block order field radius"]
     area: Float[Array, ""]
     sensor_distance: Float[Array, ""]
     to_polar: SparseTable
@@ -388,11 +397,12 @@ def stray_light_table(
     grid: PolarGrid,
     cores: PsfCores,
     ends: Sequence[float] = RINGS,
-) -> Float32[np.ndarray, "harmonic radius order field"]:
+) -> Float32[np.ndarray, "harmonic block order field radius"]:
     """Maps each harmonic of the object over the fields to the image's over the radii, at one depth.
 
-    Order 0 is the mean lens, less its cores; order 1 its change with the clear area, 1/mm^2. The angle on
-    the image counts from the direction opposite to the object's.
+    Order 0 is the mean lens, less its cores; order 1 its change with the clear area, 1/mm^2. The image is the adjoint
+    of the Fourier transform of these harmonics. What is far from a field's core or smooth is zero in most harmonics:
+    blocks of `RADII` numbers that together have `_LEFT_OUT` of the light's root mean square are left out.
     """
     fields = grid.step * grid.nodes(grid.fields)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS), aperture)
@@ -418,7 +428,21 @@ def stray_light_table(
     finest = np.pi * np.maximum(grid.nodes(grid.radii), 0.5)
     low_pass = 1 / (1 + (np.arange(grid.angles // 2 + 1) / finest[:, None]) ** _FILTER_ORDER)
     spectra = np.fft.rfft(around).real * low_pass
-    return spectra.transpose(3, 2, 0, 1).astype(np.float32)
+    # The image lies opposite to the object, half a turn away; all harmonics but the first and last count twice.
+    count = np.full(spectra.shape[-1], 2.0)
+    count[[0, -1]] = 1
+    table = (spectra * (count / grid.angles * (-1.0) ** np.arange(len(count)))).transpose(3, 0, 1, 2)
+    table = table.reshape(*table.shape[:3], -1, RADII)  # harmonic, order, field, block, radius
+    clear = np.asarray(clear_area(imager.array))
+    spread = max(np.std(clear), _LEAST_SPREAD * np.mean(clear))
+    areas = grid.areas(grid.radii).reshape(-1, RADII)
+    orders, fields = np.array([1, spread**2]), grid.areas(grid.fields)
+    energy = np.einsum("h,hofbr,o,f,br->hofb", 1 / count, table**2, orders, fields, 1 / areas)
+    ascending = np.sort(energy, None)
+    few = np.searchsorted(np.cumsum(ascending), _LEFT_OUT**2 * ascending.sum())
+    kept = energy >= ascending[min(few, ascending.size - 1)]
+    kept[:_WHOLE] = True
+    return (table * kept[..., None]).transpose(0, 3, 1, 2, 4).astype(np.float32)
 
 
 def _bin_polar(grid, landing, light):

@@ -23,8 +23,8 @@ from ..optics.field_varying import StrayLight
 from .cpu.loading import kernels
 from .cuda import SCATTERS
 
-# Lenses whose stray light is computed at once, which bounds the memory.
-_LENSES = 112
+# Lenses whose stray light is computed at once: few stay in a CPU's cache, many keep an accelerator busy.
+_LENSES, _LENSES_ON_CPU = 112, 32
 # Kernels take sixteen lenses at once, and read so many pixels beyond a window.
 _SPARE = 16
 # Linear interpolations blur the stray light by about this variance, in squared pixels. A Wiener filter undoes that
@@ -55,27 +55,23 @@ def stray_light_image(
     nodes = jnp.pad(nodes, [(0, 0), *[(inner + 1, inner + 1 + _SPARE)] * 2])
     axes, image_of_axis = imager.axis_offset(depths).astype(dtype), imager.image_of_axis.astype(dtype)
     # One matrix for both orders.
-    table = optics.table.astype(dtype).reshape(*optics.table.shape[:3], -1)
-    half_turn = (jnp.arange(polar_grid.angles // 2 + 1) % 2 == 1)[:, None, None]
+    table = optics.table.astype(dtype)
+    table = table.reshape(*table.shape[:3], -1, table.shape[-1])
 
     def add_lenses(image, lenses):
         centers, excess = lenses
 
-        def add_depth(spots, plane):
-            nodes, table, axis = plane
+        def add_depth(spectra, plane):
+            depth, nodes, axis = plane
             places = _window_places(centers + axis[None], origin.astype(dtype), polar_grid.step, nodes.shape, inner)
-            objects = interpolate_windows(Windows(nodes.shape, inner), places, nodes)
-            polar = times_table((), optics.to_polar, objects.reshape(-1, len(centers)))
-            spectrum = jnp.fft.rfft(polar.reshape(polar_grid.angles, polar_grid.fields, -1), axis=0)
-            parts = jnp.concatenate([spectrum.real, spectrum.imag], -1)
-            return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)[None, None]], 1), None
+            objects = interpolate_windows(Windows(nodes.shape, inner), places, nodes).reshape(-1, len(centers))
+            fields = angular_spectra(polar_grid.angles, optics.to_polar, objects)
+            return add_products((), (table, depth, excess), (spectra, fields)), None
 
-        empty = jnp.zeros((polar_grid.angles // 2 + 1, polar_grid.radii, 2 * len(centers)), dtype)
-        spots = lax.scan(jax.checkpoint(add_depth), empty, (nodes, table, axes))[0]
-        # The image lies opposite to the object: half a turn.
-        spots = lax.complex(*jnp.split(jnp.where(half_turn, -spots, spots), 2, -1))
-        polar = jnp.fft.irfft(spots, polar_grid.angles, axis=0).reshape(-1, len(centers))
-        spots = times_table((), optics.to_pixels, polar).reshape(outer, outer, -1)
+        dark = jnp.zeros((2 * table.shape[1], polar_grid.radii, len(centers)), dtype)
+        planes = jnp.arange(len(table), dtype=jnp.int32), nodes, axes
+        spectra = lax.scan(jax.checkpoint(add_depth), dark, planes)[0]
+        spots = angular_spectra.T(polar_grid.angles, optics.to_pixels.T, spectra).reshape(outer, outer, -1)
         middle = jnp.asarray(imager.sensor.origin, dtype)
         places = _window_places(centers + image_of_axis[None], middle, pixel, image.shape, outer)
         return image + interpolate_windows.T(Windows(image.shape, outer), places, spots), None
@@ -92,14 +88,17 @@ def stray_light_image(
 
 
 def _lens_groups(imager, optics, dtype):
-    """Centres and excess areas of lenses, at most `_LENSES` a group; the last are filled up with lenses far away."""
+    """Centres and excess areas of groups of lenses, which are filled up with lenses far away.
+
+    They are in the order of their rows: kernels read windows that are near each other at once.
+    """
     centers, excess = imager.centers.astype(dtype), clear_area(imager.array).astype(dtype) - optics.area.astype(dtype)
-    count = len(excess)
-    groups = -(-count // _LENSES)
+    order, count = jnp.argsort(centers[:, 1]), len(excess)
+    groups = -(-count // (_LENSES_ON_CPU if jax.default_backend() == "cpu" else _LENSES))
     size = -(-count // (groups * _SPARE)) * _SPARE
     missing = groups * size - count
-    centers = jnp.pad(centers, [(0, missing), (0, 0)], constant_values=1e6)
-    return centers.reshape(groups, size, 2), jnp.pad(excess, (0, missing)).reshape(groups, size)
+    centers = jnp.pad(centers[order], [(0, missing), (0, 0)], constant_values=1e6)
+    return centers.reshape(groups, size, 2), jnp.pad(excess[order], (0, missing)).reshape(groups, size)
 
 
 def to_nodes(volume, grid, polar_grid):
@@ -204,8 +203,40 @@ def _wiener_matrix(count: int) -> Float[np.ndarray, "pixel pixel"]:
     return kernel[np.arange(count)[:, None] - np.arange(count)]
 
 
-times_table = LinearMap(
-    lambda _, table, x: times_entries(table.rows, x),
-    lambda _, table, y: times_entries(table.columns, y),
-    kernels=kernels("times_rows", "times_columns"),
-)
+def _to_spectra(angles, table, x):
+    polar = times_entries(table.rows, x)
+    return _transform(polar.reshape(angles, -1, x.shape[1]))
+
+
+def _from_spectra(angles, table, y):
+    polar = jax.linear_transpose(_transform, jax.ShapeDtypeStruct((angles, *y.shape[1:]), y.dtype))(y)[0]
+    return times_entries(table.columns, polar.reshape(-1, y.shape[2]))
+
+
+def _transform(polar):
+    spectra = jnp.fft.rfft(polar, axis=0)
+    return jnp.stack([spectra.real, spectra.imag], 1).reshape(-1, *polar.shape[1:])
+
+
+# `(angles, table, x)`: spectra over the angle, `(2 harmonics, field, lens)`, of a sparse table's products; of each
+# harmonic the real part before the imaginary one.
+angular_spectra = LinearMap(_to_spectra, _from_spectra, kernels=kernels("to_spectra", "from_spectra"))
+
+
+def _add_products(_, constants, parts):
+    (table, depth, excess), (total, x) = constants, parts
+    x = x.reshape(table.shape[1], 2, -1, x.shape[-1])
+    products = jnp.einsum("hbfr,hcfl->hcbrl", table[depth], jnp.concatenate([x, excess[None, None, None] * x], 2))
+    return total + products.reshape(total.shape)
+
+
+def _products_back(_, constants, y):
+    table, depth, excess = constants
+    image = y.reshape(table.shape[1], 2, table.shape[2], table.shape[4], -1)
+    x = jnp.einsum("hbfr,hcbrl->hcfl", table[depth], image)
+    mean, change = jnp.split(x, 2, 2)
+    return y, (mean + excess[None, None, None] * change).reshape(len(y), -1, y.shape[-1])
+
+
+# `((), (table, depth, excess), (total, x))`: a sum, and each harmonic's product with its table at this depth.
+add_products = LinearMap(_add_products, _products_back, kernels=kernels("add_products", "products_back"))

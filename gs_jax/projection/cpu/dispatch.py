@@ -20,7 +20,7 @@ from numba.core.caching import FunctionCache
 
 from ...linear.fourier import kernel_spectrum
 from ..rays import Rays, weight_numbers
-from . import ffi, fftconv, kernels, windows
+from . import ffi, fftconv, kernels, spectra, windows
 from .simd import FAST, WIDTH
 
 # The handler's name for XLA, and the version of the structures that it reads. XLA refuses one that it does not support.
@@ -36,8 +36,10 @@ KERNELS = {
     "correlate": fftconv.overlap_save,
     "read_windows": windows.read_windows,
     "add_windows": windows.add_windows,
-    "times_rows": windows.times_rows,
-    "times_columns": windows.times_rows,
+    "to_spectra": spectra.to_spectra,
+    "from_spectra": spectra.from_spectra,
+    "add_products": spectra.add_products,
+    "products_back": spectra.products_back,
 }
 _table = np.zeros(ffi.FIRST_KERNEL + len(KERNELS), np.int64)
 _NO_MEMORY = ctypes.create_string_buffer(b"gs_jax: no memory for a kernel of back-projection or the forward model")
@@ -195,11 +197,14 @@ def _overlap_save(name, kernels, images, shapes, shift):
     real, imaginary = jax.vmap(lambda kernel: kernel_spectrum(kernel, turns, turns))(kernels)
     strips = lambda part: part.reshape(len(kernels), -1, WIDTH, side).swapaxes(2, 3)
     spectra = jnp.stack([strips(real), strips(imaginary)], 2).reshape(len(kernels), 2 * side, side) / side**2
-    angles = 2 * np.pi * np.arange(side) / side
     plan = np.array([len(images), len(shapes), shift, (side - size + 1) // WIDTH * WIDTH], np.int32)
     results = [ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    table = np.stack([np.cos(angles), np.sin(angles)], -1).astype(np.float32)
-    return _call(name, results, plan, table, spectra, *images)
+    return _call(name, results, plan, _turns(side), spectra, *images)
+
+
+def _turns(side: int) -> np.ndarray:
+    angles = 2 * np.pi * np.arange(side) / side
+    return np.stack([np.cos(angles), np.sin(angles)], -1).astype(np.float32)
 
 
 def read_windows(windows, places, image):
@@ -229,26 +234,54 @@ def _whole_last_axis(array):
     return jnp.pad(array, [*[(0, 0)] * (array.ndim - 1), (0, -array.shape[-1] % WIDTH)])
 
 
-def times_rows(_, matrix, x):
-    return _times("times_rows", matrix.rows, x)
+def to_spectra(angles, table, x):
+    lenses, whole = x.shape[1], _whole_last_axis(x)
+    shape = 2 * (angles // 2 + 1), (len(table.rows.start) - 1) // angles, whole.shape[1]
+    return _of_angles("to_spectra", angles, table.rows, len(x) == table.rows.columns, shape, whole)[..., :lenses]
 
 
-def times_columns(_, matrix, x):
-    return _times("times_columns", matrix.columns, x)
+def from_spectra(angles, table, y):
+    lenses, whole, nodes = y.shape[2], _whole_last_axis(y), len(table.columns.start) - 1
+    fit = y.shape[:2] == (2 * (angles // 2 + 1), table.columns.columns // angles)
+    return _of_angles("from_spectra", angles, table.columns, fit, (nodes, whole.shape[2]), whole)[:, :lenses]
 
 
-def _times(kernel, entries, x):
+def _of_angles(kernel, angles, entries, fit, shape, x):
     # Places of entries are checked where tables are made.
     start, place, share = entries.start, entries.place, entries.share
-    _require(kernel, x.ndim == 2 and len(x) == entries.columns and place.shape == share.shape, start, place, share, x)
-    whole = _whole_last_axis(x)
-    result = ShapeDtypeStruct((len(start) - 1, whole.shape[1]), jnp.float32)
-    return _call(kernel, result, start, place, share, whole)[:, : x.shape[1]]
+    power = angles // 3 if angles % 3 == 0 else angles
+    fit = fit and place.shape == share.shape and power >= 4 and power & (power - 1) == 0
+    _require(kernel, fit, start, place, share, x)
+    order = np.argsort(_frequencies(angles)).astype(np.int32)
+    return _call(kernel, ShapeDtypeStruct(shape, jnp.float32), start, place, share, _turns(angles), order, x)
+
+
+def add_products(_, constants, parts):
+    (table, depth, excess), (total, x) = constants, map(_whole_last_axis, parts)
+    tables = _product_tables("add_products", table, depth, excess, total, x)
+    return _call("add_products", ShapeDtypeStruct(total.shape, jnp.float32), *tables, total, x)[..., : len(excess)]
+
+
+def products_back(_, constants, y):
+    (table, depth, excess), whole = constants, _whole_last_axis(y)
+    result = ShapeDtypeStruct((len(y), table.shape[3] // 2, whole.shape[2]), jnp.float32)
+    tables = _product_tables("products_back", table, depth, excess, whole, result)
+    return y, _call("products_back", result, *tables, whole)[..., : len(excess)]
+
+
+def _product_tables(kernel, table, depth, excess, image, x):
+    (_, harmonics, blocks, columns, radii), excess = table.shape, _whole_last_axis(excess)
+    fit = image.shape == (2 * harmonics, blocks * radii, len(excess)) and radii == spectra.ROWS
+    fit = fit and x.shape == (2 * harmonics, columns // 2, len(excess)) and depth.dtype == jnp.int32
+    _require(kernel, fit and depth.ndim == 0, table, excess, image, x)
+    # The depth chooses rows of the table, which must exist.
+    return table.reshape(-1, columns, radii), jnp.clip(depth, 0, len(table) - 1), excess
 
 
 @cache
 def _frequencies(side: int) -> np.ndarray:
-    """The order of frequencies after radix-4 transforms."""
+    """The order of frequencies after transforms."""
     if side <= 2:
         return np.arange(side)
-    return (4 * _frequencies(side // 4)[None] + np.arange(4)[:, None]).ravel()
+    radix = 3 if side % 3 == 0 else 4
+    return (radix * _frequencies(side // radix)[None] + np.arange(radix)[:, None]).ravel()

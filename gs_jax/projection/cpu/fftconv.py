@@ -9,13 +9,14 @@ stays transposed; its frequencies stay in the order in which the transform leave
 import numpy as np
 
 from . import rows, simd
-from .rows import BUFFERS, PARTS, PER_BUFFER, ZERO
+from .rows import BUFFERS, HALF, PARTS, PER_BUFFER, ZERO
 from .simd import WIDTH, function, inline
 
 # Buffers: a plan, cosines and sines, spectra; images follow, and sums of them.
 _PLAN, _TURNS, _SPECTRA, _IMAGES = range(4)
 # Bytes of sixteen numbers.
 _STEP = 4 * WIDTH
+_SIN_60 = np.float32(np.sqrt(0.75))
 
 
 def overlap_save(job_address, part, _):
@@ -25,7 +26,7 @@ def overlap_save(job_address, part, _):
     plan = rows.integers(job, _PLAN)[:, 0, 0]
     images, sums, shift, kept = np.int64(plan[0]), np.int64(plan[1]), np.int64(plan[2]), np.int64(plan[3])
     turns, side = rows.address(job, _TURNS), rows.size(job, _TURNS, 0)
-    strip = 2 * _plane(side)
+    strip = 2 * plane_bytes(side)
     tile = strip * (side // WIDTH)
     scratch = np.empty(3 * tile // 4 + WIDTH, np.float32)
     edge = np.zeros(WIDTH, np.float32)
@@ -48,33 +49,33 @@ def overlap_save(job_address, part, _):
                 if result == 0:
                     place = BUFFERS + PER_BUFFER * (_IMAGES + number)
                     lit1 = _read(job, place, row1 + shift, column1 + shift, at_last, side, at_edge)
-                    lit2 = _read(job, place, row2 + shift, column2 + shift, at_last + _plane(side), side, at_edge)
+                    lit2 = _read(job, place, row2 + shift, column2 + shift, at_last + plane_bytes(side), side, at_edge)
                     lit = lit1 or lit2
                     if lit:
                         for s in range(side // WIDTH):
-                            _transform(at_last + strip * s, side, turns)
+                            transform(at_last + strip * s, side, turns)
                             _transpose(at_last + strip * s, at_tile, s, side)
                         for s in range(side // WIDTH):
-                            _transform(at_tile + strip * s, side, turns)
+                            transform(at_tile + strip * s, side, turns)
                 if lit:
                     factors = rows.address(job, _SPECTRA) + 8 * side * side * (result if images == 1 else number)
                     _multiply(at_tile, factors, at_sum, side, fresh)
                     fresh = False
             if not fresh:
                 for s in range(side // WIDTH):
-                    _transform_back(at_sum + strip * s, side, turns)
+                    transform_back(at_sum + strip * s, side, turns)
                     _transpose(at_sum + strip * s, at_last, s, side)
             place = BUFFERS + PER_BUFFER * (_IMAGES + images + result)
             if not fresh:
                 for s in range((kept + WIDTH - 1) // WIDTH):
-                    _transform_back(at_last + strip * s, side, turns)
+                    transform_back(at_last + strip * s, side, turns)
             _write(job, place, row1, column1, at_last, side, kept, fresh, at_edge)
-            _write(job, place, row2, column2, at_last + _plane(side), side, kept, fresh, at_edge)
+            _write(job, place, row2, column2, at_last + plane_bytes(side), side, kept, fresh, at_edge)
     return rows.keep_alive((scratch, edge))
 
 
 @inline
-def _plane(side):
+def plane_bytes(side):
     """Bytes from a strip's real parts to its imaginary ones; a line more, or all rows would share few cache lines."""
     return _STEP * (side + 1)
 
@@ -82,7 +83,7 @@ def _plane(side):
 @function
 def _read(job, place, row, column, at, side, at_edge):
     """Copy a tile of an image, zero beyond it, to one plane of the strips; returns whether any pixel is not zero."""
-    tall, wide, strip = job[place + 2], job[place + 3], 2 * _plane(side)
+    tall, wide, strip = job[place + 2], job[place + 3], 2 * plane_bytes(side)
     inside, seen = column >= 0 and column + side <= wide, simd.zeros()
     for y in range(side):
         exists = row + y >= 0 and row + y < tall
@@ -110,7 +111,7 @@ def _load_some(address, column, wide, at_edge):
 @function
 def _write(job, place, row, column, at, side, kept, dark, at_edge):
     """Copy what is kept of a tile from one plane of the strips to an image."""
-    tall, wide, strip = job[place + 2], job[place + 3], 2 * _plane(side)
+    tall, wide, strip = job[place + 2], job[place + 3], 2 * plane_bytes(side)
     for y in range(min(kept, tall - row)):
         source, target = at + _STEP * y, job[place] + 4 * ((row + y) * wide + column)
         for s in range(kept // WIDTH):
@@ -127,7 +128,7 @@ def _write(job, place, row, column, at, side, kept, dark, at_edge):
 @function
 def _transpose(at_strip, at_tile, number, side):
     """Copy a strip's rows to columns of a tile."""
-    plane = _plane(side)
+    plane = plane_bytes(side)
     for block in range(side // WIDTH):
         source, target = at_strip + _STEP * WIDTH * block, at_tile + 2 * plane * block + _STEP * WIDTH * number
         simd.transpose(source, target)
@@ -137,7 +138,7 @@ def _transpose(at_strip, at_tile, number, side):
 @function
 def _multiply(at_tile, at_factors, at_sum, side, fresh):
     """Add the product of a tile and a spectrum to the sum, or begin it."""
-    plane, place, factor = _plane(side), 0, at_factors
+    plane, place, factor = plane_bytes(side), 0, at_factors
     for _ in range(side // WIDTH):
         for _ in range(side):
             a, b = simd.load(at_tile + place), simd.load(at_tile + place + plane)
@@ -162,6 +163,18 @@ def _load_four(at, step):
 
 
 @inline
+def _load_three(at, step):
+    return simd.load(at), simd.load(at + step), simd.load(at + 2 * step)
+
+
+@inline
+def _store_three(at, step, a, b, c):
+    simd.store(at, a)
+    simd.store(at + step, b)
+    simd.store(at + 2 * step, c)
+
+
+@inline
 def _store_four(at, step, a, b, c, d):
     simd.store(at, a)
     simd.store(at + step, b)
@@ -170,9 +183,12 @@ def _store_four(at, step, a, b, c, d):
 
 
 @function
-def _transform(at, side, turns):
-    """FFT of the columns of a strip, in place: radix 4, and radix 2 at the end where it is needed."""
-    plane, span = _plane(side), side
+def transform(at, side, turns):
+    """FFT of the columns of a strip, in place: radix 3 at first and radix 2 at the end where needed, else radix 4."""
+    plane, span = plane_bytes(side), side
+    if side % 3 == 0:
+        _radix_3(at, side, turns)
+        span = side // 3
     while span > 2:
         quarter, stride = span // 4, side // span
         q = _STEP * quarter
@@ -194,17 +210,17 @@ def _transform(at, side, turns):
 
 
 @function
-def _transform_back(at, side, turns):
-    """The inverse of `_transform`, times `side`."""
-    plane, span = _plane(side), 4
-    while span < side:
+def transform_back(at, side, turns):
+    """The inverse of `transform`, times `side`."""
+    plane, last, span = plane_bytes(side), side // 3 if side % 3 == 0 else side, 4
+    while span < last:
         span *= 4
-    if span > side:
+    if span > last:
         _radix_2(at, side)
         span = 8
     else:
         span = 4
-    while span <= side:
+    while span <= last:
         quarter, stride = span // 4, side // span
         q = _STEP * quarter
         for k in range(quarter):
@@ -222,11 +238,40 @@ def _transform_back(at, side, turns):
                 _store_four(x, q, sr + tr, ur + wr, sr - tr, ur - wr)
                 _store_four(x + plane, q, si + ti, ui + wi, si - ti, ui - wi)
         span *= 4
+    if last < side:
+        _radix_3_back(at, side, turns)
+
+
+@inline
+def _radix_3(at, side, turns):
+    plane, q = plane_bytes(side), _STEP * (side // 3)
+    for k in range(side // 3):
+        (c1, s1), (c2, s2), x = _turn(turns, k), _turn(turns, 2 * k), at + _STEP * k
+        (ar, br, cr), (ai, bi, ci) = _load_three(x, q), _load_three(x + plane, q)
+        sr, si, ur, ui = br + cr, bi + ci, _SIN_60 * (br - cr), _SIN_60 * (bi - ci)
+        tr, ti = ar - HALF * sr, ai - HALF * si
+        er, ei, fr, fi = tr + ui, ti - ur, tr - ui, ti + ur
+        _store_three(x, q, ar + sr, er * c1 + ei * s1, fr * c2 + fi * s2)
+        _store_three(x + plane, q, ai + si, ei * c1 - er * s1, fi * c2 - fr * s2)
+
+
+@inline
+def _radix_3_back(at, side, turns):
+    plane, q = plane_bytes(side), _STEP * (side // 3)
+    for k in range(side // 3):
+        (c1, s1), (c2, s2), x = _turn(turns, k), _turn(turns, 2 * k), at + _STEP * k
+        (ar, br, cr), (ai, bi, ci) = _load_three(x, q), _load_three(x + plane, q)
+        er, ei = br * c1 - bi * s1, bi * c1 + br * s1
+        fr, fi = cr * c2 - ci * s2, ci * c2 + cr * s2
+        sr, si, ur, ui = er + fr, ei + fi, _SIN_60 * (er - fr), _SIN_60 * (ei - fi)
+        tr, ti = ar - HALF * sr, ai - HALF * si
+        _store_three(x, q, ar + sr, tr - ui, tr + ui)
+        _store_three(x + plane, q, ai + si, ti + ur, ti - ur)
 
 
 @inline
 def _radix_2(at, side):
-    for plane in (at, at + _plane(side)):
+    for plane in (at, at + plane_bytes(side)):
         for x in range(plane, plane + _STEP * side, 2 * _STEP):
             a, b = simd.load(x), simd.load(x + _STEP)
             simd.store(x, a + b)

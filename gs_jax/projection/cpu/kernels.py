@@ -113,7 +113,7 @@ def scatter(job_address, part, _):
     """Volume to image; a part is a band of rows of pixels."""
     job = rows.job_at(job_address)
     tables = rows.read_tables(job)
-    limit2 = tables.numbers[1]
+    limit2, hole2 = tables.numbers[1], rows.hole_limit2(tables)
     lenses, depths, ny = tables.y_pixel.shape
     nx = tables.x_pixel.shape[2]
     height, width = rows.size(job, FIRST, 1), rows.size(job, FIRST, 2)
@@ -145,7 +145,7 @@ def scatter(job_address, part, _):
             if begin == end:
                 continue
             start, most = fill_taps(taps, here, begin, end, wide)
-            many = lines_needed(here, begin, end)
+            many, hole, beyond = lines_needed(here, begin, end), 0, 0
             for k in range(first, last):
                 y2 = tables.y_distance2[lens, d, k]
                 if y2 >= limit2:
@@ -154,12 +154,17 @@ def scatter(job_address, part, _):
                 if begin == end:
                     begin, end = shift, shift + nx
                     continue
+                hole, beyond = rows.hole(x2[: shift + nx], y2, hole2, begin, end, hole, beyond)
+                # Blocks of voxels in the hole, whose pixels get no light.
+                dark, light = rows.padded(hole), beyond // WIDTH * WIDTH
                 i, down = rows.pixel_row(tables, lens, d, k, tall)
                 at_upper = rows.address(job, FIRST + 1) + 4 * i * wide
                 at_lower = at_upper + 4 * wide if i + 1 >= top and i + 1 < bottom else at_spare
                 at_upper = at_upper if i >= top and i < bottom else at_spare
                 at_row = rows.address(job, FIRST) + 4 * ((d * height + y_start + k) * width + x_start - shift)
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
+                    if most > 0 and c >= dark and c < light:
+                        continue
                     simd.prefetch(at_row + 4 * (AHEAD * width + c))
                     voxels = rows.load_voxels(at_row, c, width - x_start + shift - c, at_edge)
                     value = voxels * rows.weight(tables, d, y2 + simd.load(here.distance2 + 4 * c))
@@ -170,7 +175,13 @@ def scatter(job_address, part, _):
                         simd.store_pairs(at_pairs + 8 * c, value - after, after)
                 left, right = np.int64(low[end - 1]), np.int64(low[begin]) + 1
                 if most > 0:
+                    # Pixels between the first voxel beyond the hole and the last before it.
+                    low_dark, high_dark = wide, 0
+                    if dark < light and dark > begin and light < end:
+                        low_dark, high_dark = np.int64(low[light]) + 2, np.int64(low[dark - 1])
                     for block in range((left - start) // WIDTH, (right - start) // WIDTH + 1):
+                        if start + WIDTH * block >= low_dark and start + WIDTH * (block + 1) <= high_dark:
+                            continue
                         j = 4 * (start + WIDTH * block)
                         spread = sum_taps(taps, at_values, block, most)
                         simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * spread)

@@ -1,4 +1,4 @@
-"""Windows of an image about lenses, and sparse matrices times columns of lenses, as numba kernels.
+"""Windows of an image about lenses, as numba kernels.
 
 A kernel `(job, part)` as in `kernels`. The number of lenses, the last axis, is a multiple of sixteen: `dispatch` adds
 some that are beyond the image.
@@ -95,31 +95,3 @@ def add_windows(job_address, part, _):
                     if row + 1 < bottom:
                         simd.store(at_lower + j, simd.load(at_lower + j) + down * value)
     return rows.keep_alive((lines,))
-
-
-def times_rows(job_address, part, _):
-    """A sparse matrix (first entry of each row, columns, shares) times `(column, lens)`; a part is some rows."""
-    job = rows.job_at(job_address)
-    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
-    lenses, count = rows.size(job, 3, 1), rows.size(job, 4, 0)
-    whole = lenses // (4 * WIDTH) * 4 * WIDTH
-    for row in range(part * count // job[PARTS], (part + 1) * count // job[PARTS]):
-        begin, end = np.int64(start[row]), np.int64(start[row + 1])
-        at_result = rows.address(job, 4) + 4 * row * lenses
-        for lens in range(0, whole, 4 * WIDTH):
-            a, b, c, d = simd.zeros(), simd.zeros(), simd.zeros(), simd.zeros()
-            for entry in range(begin, end):
-                at, factor = rows.address(job, 3) + 4 * (np.int64(column[entry]) * lenses + lens), share[entry]
-                a, b = a + factor * simd.load(at), b + factor * simd.load(at + _STEP)
-                c, d = c + factor * simd.load(at + 2 * _STEP), d + factor * simd.load(at + 3 * _STEP)
-            at = at_result + 4 * lens
-            simd.store(at, a)
-            simd.store(at + _STEP, b)
-            simd.store(at + 2 * _STEP, c)
-            simd.store(at + 3 * _STEP, d)
-        for lens in range(whole, lenses, WIDTH):
-            a = simd.zeros()
-            for entry in range(begin, end):
-                a = a + share[entry] * simd.load(rows.address(job, 3) + 4 * (np.int64(column[entry]) * lenses + lens))
-            simd.store(at_result + 4 * lens, a)
-    return rows.DONE
