@@ -9,8 +9,9 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
+from . import rows
 from .rows import BUFFERS, DONE, LENGTH, OWN, PARTS, PER_BUFFER
-from .simd import I64, carray, inline, instruction, pointer
+from .simd import I64, call, carray, inline, instruction, pointer
 
 # Places in structures, in units of 8 bytes.
 EXTENSION, API, CONTEXT, ARGUMENTS, RESULTS, ATTRIBUTES = 1, 2, 3, 5, 10, 20  # of the frame
@@ -21,7 +22,7 @@ METADATA, TABLE = 1, 77  # types of extensions: XLA's, and our own, which tells 
 # Places in the table: addresses of functions, the version, addresses of an error's arguments and of the kernels.
 TASK, ALLOCATE, FREE, YIELD, ADVISE, MAJOR, MINOR, NO_MEMORY, FIRST_KERNEL = range(9)
 # Places in a job, besides its parts, length and buffers.
-_REFERENCES, _NEXT, _DONE, _KERNEL, _FREE, _FAILED = 0, 1, 2, 4, 5, 7
+_REFERENCES, _NEXT, _DONE, _KERNEL, _FAILED = 0, 1, 2, 4, 7
 
 
 @instruction(types.int64)
@@ -40,13 +41,6 @@ def _fetch_add(builder, address, number):
     return builder.atomic_rmw("add", builder.inttoptr(address, I64.as_pointer()), number, "seq_cst")
 
 
-@instruction(types.int64)
-def _call(builder, function, first, second, third):
-    """Call a C function by its address; one with fewer arguments ignores the rest."""
-    kind = ir.FunctionType(I64, [I64, I64, I64]).as_pointer()
-    return builder.call(builder.inttoptr(function, kind), [first, second, third])
-
-
 @inline
 def _at(address, length):
     return carray(pointer(address), length, np.int64)
@@ -60,7 +54,7 @@ def _work(address):
         part = _fetch_add(address + 8 * _NEXT, 1)
         if part >= job[PARTS]:
             return
-        if _call(job[_KERNEL], address, part, 0) != DONE:
+        if call(job[_KERNEL], address, part, 0) != DONE:
             _fetch_add(address + 8 * _FAILED, 1)
         _fetch_add(address + 8 * _DONE, 1)
 
@@ -68,7 +62,7 @@ def _work(address):
 @inline
 def _release(address):
     if _fetch_add(address + 8 * _REFERENCES, -1) == 1:
-        _call(_at(address, OWN)[_FREE], address, 0, 0)
+        call(_at(address, OWN)[rows.FREE], address, 0, 0)
 
 
 def task(address, _):
@@ -97,7 +91,7 @@ def _use_large_pages(job, place, advise):
     first = (job[place] + page - 1) // page * page
     pages = (job[place] + 4 * job[place + 2] * job[place + 3] * job[place + 4] - first) // page
     if advise != 0 and pages > 1:
-        _call(advise, first, pages * page, 14)  # MADV_HUGEPAGE
+        call(advise, first, pages * page, 14)  # MADV_HUGEPAGE
 
 
 def handle(frame_address, _):
@@ -115,35 +109,36 @@ def handle(frame_address, _):
             return 0
     api = _at(frame[API], 19)
     length = BUFFERS + PER_BUFFER * (frame[ARGUMENTS + COUNT] + frame[RESULTS + COUNT])
-    address = _call(table[ALLOCATE], 8 * length, 0, 0)
+    address = call(table[ALLOCATE], length, 8, 0)
     if address == 0:
-        return _call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0)
+        return call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0)
     job = _at(address, length)
     attributes = _at(frame[ATTRIBUTES], 2)
     which, parts = _at(_at(attributes[0], 2)[1], 1)[0], _at(_at(attributes[1], 2)[1], 1)[0]
     job[_REFERENCES], job[_NEXT], job[_DONE], job[PARTS], job[LENGTH], job[_FAILED] = 1, 0, 0, parts, length, 0
-    job[_KERNEL], job[_FREE] = _at(at_table + 8 * FIRST_KERNEL, which + 1)[which], table[FREE]
+    job[_KERNEL] = _at(at_table + 8 * FIRST_KERNEL, which + 1)[which]
+    job[rows.ALLOCATE], job[rows.FREE] = table[ALLOCATE], table[FREE]
     arguments = _list_buffers(job, 0, frame[ARGUMENTS : ARGUMENTS + 5])
     for result in range(arguments, _list_buffers(job, arguments, frame[RESULTS : RESULTS + 5])):
         _use_large_pages(job, BUFFERS + PER_BUFFER * result, table[ADVISE])
     # XLA reads and writes the structures of its functions here.
     scratch, at_scratch, threads = job[OWN:BUFFERS], address + 8 * OWN, address + 8 * (OWN + 8)
     scratch[0], scratch[1], scratch[2], scratch[3], scratch[8] = 32, 0, frame[CONTEXT], threads, 1
-    error = _call(api[THREADS], at_scratch, 0, 0)
+    error = call(api[THREADS], at_scratch, 0, 0)
     for _ in range(min(scratch[8], parts) - 1):
         if error != 0:
             break
         _fetch_add(address + 8 * _REFERENCES, 1)
         scratch[0], scratch[1], scratch[2], scratch[3], scratch[4] = 40, 0, frame[CONTEXT], table[TASK], address
-        error = _call(api[SCHEDULE], at_scratch, 0, 0)
+        error = call(api[SCHEDULE], at_scratch, 0, 0)
         if error != 0:
             _fetch_add(address + 8 * _REFERENCES, -1)
     if error != 0:  # no threads: all is done here
         scratch[0], scratch[1], scratch[2] = 24, 0, error
-        _call(api[ERROR_DESTROY], at_scratch, 0, 0)
+        call(api[ERROR_DESTROY], at_scratch, 0, 0)
     _work(address)
     while _fetch_add(address + 8 * _DONE, 0) < parts:
-        _call(table[YIELD], 0, 0, 0)
+        call(table[YIELD], 0, 0, 0)
     failed = job[_FAILED] > 0
     _release(address)
-    return _call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0) if failed else 0
+    return call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0) if failed else 0

@@ -9,6 +9,7 @@ stays transposed; its frequencies stay in the order in which the transform leave
 import numpy as np
 
 from . import rows, simd
+from .gather import align
 from .rows import BUFFERS, PARTS, PER_BUFFER, ZERO
 from .simd import WIDTH, function, inline
 
@@ -27,11 +28,11 @@ def overlap_save(job_address, part, _):
     turns, side = rows.address(job, _TURNS), rows.size(job, _TURNS, 0)
     strip = 2 * _plane(side)
     tile = strip * (side // WIDTH)
-    scratch = np.empty(3 * tile // 4 + WIDTH, np.float32)
-    edge = np.zeros(WIDTH, np.float32)
-    at_edge = np.int64(edge.ctypes.data)
-    at_tile = (np.int64(scratch.ctypes.data) + _STEP - 1) // _STEP * _STEP
-    at_sum, at_last = at_tile + tile, at_tile + 2 * tile
+    memory = rows.allocate(job, 3 * tile // 4 + WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_tile = align(memory)
+    at_sum, at_last, at_edge = at_tile + tile, at_tile + 2 * tile, at_tile + 3 * tile
     tall, wide = rows.size(job, _IMAGES + images, 0), rows.size(job, _IMAGES + images, 1)
     across = (wide + kept - 1) // kept
     tiles = (tall + kept - 1) // kept * across
@@ -70,7 +71,7 @@ def overlap_save(job_address, part, _):
                     _transform_back(at_last + strip * s, side, turns)
             _write(job, place, row1, column1, at_last, side, kept, fresh, at_edge)
             _write(job, place, row2, column2, at_last + _plane(side), side, kept, fresh, at_edge)
-    return rows.keep_alive((scratch, edge))
+    return rows.free(job, memory)
 
 
 @inline

@@ -27,9 +27,8 @@ class Columns(NamedTuple):
     length: int  # number of columns, with the padding of their blocks
 
 
-# So many zeros from `align` on.
-scratch = inline(lambda count: np.zeros(count + WIDTH, np.float32))
-align = inline(lambda numbers: (np.int64(numbers.ctypes.data) + 4 * WIDTH - 1) // (4 * WIDTH) * (4 * WIDTH))
+# Where a line of the cache begins.
+align = inline(lambda at: (at + 4 * WIDTH - 1) // (4 * WIDTH) * (4 * WIDTH))
 # The most columns in a patch's blocks, and the numbers of `Columns` and `Taps`.
 padded = inline(lambda nx: rows.padded(nx + WIDTH))
 columns_size = inline(lambda nx: 4 * padded(nx))

@@ -28,7 +28,6 @@ from .gather import (
     lines_needed,
     padded,
     prefetch_rows,
-    scratch,
     set_windows,
     sum_taps,
     take_sum,
@@ -54,18 +53,21 @@ def gather(job_address, part, _):
     nx = tables.x_pixel.shape[2]
     # An image of ones is not read.
     tall, wide = (rows.size(job, FIRST, 0), rows.size(job, FIRST, 1)) if has_image else (2, 2)
-    volume = rows.floats(job, FIRST + 1)
-    height, width = volume.shape[1:]
+    height, width = rows.size(job, FIRST + 1, 1), rows.size(job, FIRST + 1, 2)
     top, bottom = part * height // job[PARTS], (part + 1) * height // job[PARTS]
     # Sums are kept in rows that begin where lines of the cache do.
     stride = rows.padded(width) + WIDTH
-    sums, lines = scratch(depths * (bottom - top) * stride), scratch(columns_size(nx) + 2 * padded(nx) + wide + WIDTH)
-    at_sums, at_lines = align(sums), align(lines)
+    many = depths * (bottom - top) * stride
+    memory = rows.allocate(job, many + columns_size(nx) + 2 * padded(nx) + wide + WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_sums = align(memory)
+    at_lines = at_sums + 4 * many
     at_pairs = at_lines + 4 * columns_size(nx)
     at_blended, here = at_pairs + 8 * padded(nx), columns_at(at_lines, nx)
     x2 = floats(here.distance2, here.length)
     if not has_image:
-        floats(at_pairs, 2 * here.length)[:] = ONE
+        rows.fill(at_pairs, 2 * here.length, ONE)
     for lens in range(lenses):
         for d in range(depths):
             y_start, x_start = rows.patch(tables, lens, d, height, width)
@@ -105,8 +107,11 @@ def gather(job_address, part, _):
                     simd.store(at_row + 4 * c, simd.load(at_row + 4 * c) + value)
     for d in range(depths):
         for k in range(bottom - top):
-            volume[d, top + k] = floats(at_sums + 4 * (d * (bottom - top) + k) * stride, width)
-    return rows.keep_alive((sums, lines))
+            row = floats(at_sums + 4 * (d * (bottom - top) + k) * stride, width)
+            target = floats(rows.address(job, FIRST + 1) + 4 * (d * height + top + k) * width, width)
+            for column in range(width):
+                target[column] = row[column]
+    return rows.free(job, memory)
 
 
 def scatter(job_address, part, _):
@@ -117,13 +122,15 @@ def scatter(job_address, part, _):
     lenses, depths, ny = tables.y_pixel.shape
     nx = tables.x_pixel.shape[2]
     height, width = rows.size(job, FIRST, 1), rows.size(job, FIRST, 2)
-    image = rows.floats(job, FIRST + 1)[:, :, 0]
-    tall, wide = image.shape
+    tall, wide = rows.size(job, FIRST + 1, 0), rows.size(job, FIRST + 1, 1)
     top, bottom = part * tall // job[PARTS], (part + 1) * tall // job[PARTS]
-    image[top:bottom] = ZERO
+    rows.fill(rows.address(job, FIRST + 1) + 4 * top * wide, (bottom - top) * wide, ZERO)
     space, length = padded(nx), rows.padded(wide + WIDTH)
-    lines = scratch(columns_size(nx) + taps_size(wide) + 3 * space + 3 * WIDTH + (1 + LINES) * length)
-    at_columns = align(lines)
+    many = columns_size(nx) + taps_size(wide) + 3 * space + 3 * WIDTH + (1 + LINES) * length
+    memory = rows.allocate(job, many)
+    if memory == 0:
+        return rows.FAILED
+    at_columns = align(memory)
     at_taps = at_columns + 4 * columns_size(nx)
     at_pairs = at_taps + 4 * taps_size(wide)
     at_spare = at_pairs + 8 * space  # a row of pixels that belongs to another part goes here and is not read
@@ -185,7 +192,7 @@ def scatter(job_address, part, _):
                     spread = take_sum(at_lines + j, many, 4 * length)
                     simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * spread)
                     simd.store(at_lower + j, simd.load(at_lower + j) + down * spread)
-    return rows.keep_alive((lines,))
+    return rows.free(job, memory)
 
 
 def rays_vjp(job_address, part, _):
@@ -201,8 +208,10 @@ def rays_vjp(job_address, part, _):
     x_fraction_sums, x_distance2_sums = rows.floats(job, FIRST + 4), rows.floats(job, FIRST + 5)
     parameters_sums = rows.floats(job, FIRST + 6)  # of each lens
     many, space, length = parameters_sums.shape[2], padded(nx), rows.padded(wide + WIDTH)
-    lines = scratch(columns_size(nx) + 6 * space + 2 * length + many * WIDTH + WIDTH)
-    at_columns = align(lines)
+    memory = rows.allocate(job, columns_size(nx) + 6 * space + 2 * length + many * WIDTH + WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_columns = align(memory)
     at_x_sums = at_columns + 4 * columns_size(nx)
     at_x2_sums = at_x_sums + 4 * space
     # Of two pixels: their values, and their derivatives along y, which are zero for an image of ones.
@@ -214,9 +223,8 @@ def rays_vjp(job_address, part, _):
     at_edge = at_sums + 4 * many * WIDTH
     here = columns_at(at_columns, nx)
     x2, x_sums = floats(here.distance2, here.length), floats(at_x_sums, 2 * space)
-    sums = floats(at_sums, many * WIDTH)
     if not has_image:
-        floats(at_pairs, 2 * space)[:] = ONE
+        rows.fill(at_pairs, 2 * space, ONE)
     for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
         for d in range(depths):
             y_start, x_start = rows.patch(tables, lens, d, height, width)
@@ -224,7 +232,8 @@ def rays_vjp(job_address, part, _):
             fill_columns(here, job, tables, lens, d, shift, wide)
             size = set_windows(here, shift, nx, wide) if has_image else 0
             begin, end = shift, shift + nx
-            x_sums[:], sums[:] = ZERO, ZERO
+            rows.fill(at_x_sums, 2 * space, ZERO)
+            rows.fill(at_sums, many * WIDTH, ZERO)
             for k in range(ny):
                 y2 = tables.y_distance2[lens, d, k]
                 y_fraction_sums[lens, d, k], y_distance2_sums[lens, d, k] = ZERO, ZERO
@@ -272,5 +281,5 @@ def rays_vjp(job_address, part, _):
                 x_fraction_sums[lens, d, c] = x_sums[shift + c]
                 x_distance2_sums[lens, d, c] = x_sums[space + shift + c]
             for number in range(many):
-                parameters_sums[lens, d, number] = sums[WIDTH * number : WIDTH * number + WIDTH].sum()
-    return rows.keep_alive((lines,))
+                parameters_sums[lens, d, number] = simd.total(simd.load(at_sums + 4 * WIDTH * number))
+    return rows.free(job, memory)

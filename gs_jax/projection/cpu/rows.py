@@ -7,13 +7,13 @@ import numpy as np
 from . import simd
 from .simd import WIDTH, carray, inline
 
-# A job is a list of 64-bit numbers: eight of its own, sixteen for arguments of XLA's functions, then address, type and
+# A job is a list of 64-bit numbers: nine of its own, sixteen for arguments of XLA's functions, then address, type and
 # three sizes of each buffer.
-PARTS, LENGTH, OWN, BUFFERS, PER_BUFFER = 3, 6, 8, 24, 5
+PARTS, FREE, LENGTH, ALLOCATE, OWN, BUFFERS, PER_BUFFER = 3, 5, 6, 8, 9, 25, 5
 # Buffers: numbers of the weight, its parameters, start, pixel, fraction and distance2 of y and of x, and what follows.
 FIRST = 10
-# What kernels return. One that fails, because there is no memory for its scratch, returns 0.
-DONE = 1
+# What kernels return: `FAILED` if there is no memory for their scratch.
+DONE, FAILED = 1, 0
 ZERO, HALF, ONE, TWO, THREE, SIX, FAR = (np.float32(n) for n in (0, 0.5, 1, 2, 3, 6, 1e8))
 
 
@@ -46,6 +46,26 @@ pixel_bytes = inline(lambda kind: 1 if kind == simd.UINT8 else 2 if kind == simd
 def job_at(address):
     own = carray(simd.pointer(address), OWN, np.int64)
     return carray(simd.pointer(address), own[LENGTH], np.int64)
+
+
+@inline
+def allocate(job, count):
+    """The address of so many zeros (float32) from `align` on; 0 if there is no memory for them."""
+    return simd.call(job[ALLOCATE], count + WIDTH, 4, 0)
+
+
+@inline
+def free(job, at):
+    """Free what `allocate` returned. Returns `DONE`."""
+    simd.call(job[FREE], at, 0, 0)
+    return DONE
+
+
+@inline
+def fill(at, count, number):
+    values = carray(simd.pointer(at), count, np.float32)
+    for n in range(count):
+        values[n] = number
 
 
 @inline
@@ -220,11 +240,3 @@ def first_below(pixel, limit):
         else:
             low = middle + 1
     return low
-
-
-@inline
-def keep_alive(arrays):
-    """Numba frees an array after its last use, and does not count the use of its address. Returns `DONE`."""
-    for array in arrays:
-        array[0] = ZERO
-    return DONE

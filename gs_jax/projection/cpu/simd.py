@@ -20,6 +20,8 @@ BOOL, UINT8, UINT16 = 1, 6, 7
 # Sums may be reordered, but NaN stays NaN.
 FLAGS = ("reassoc", "nsz", "arcp", "contract", "afn")
 FAST = {"fastmath": set(FLAGS), "error_model": "numpy"}
+# Of functions that only kernels call.
+_WITHIN = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 I8, I32, I64, F32 = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
 FLOATS, INTEGERS = ir.VectorType(F32, WIDTH), ir.VectorType(I32, WIDTH)
 TWO, PAIRS = ir.VectorType(F32, 2), ir.VectorType(F32, 2 * WIDTH)
@@ -31,12 +33,12 @@ carray: Any = _carray
 
 def inline(function):
     """Compile a function into its callers. Type checkers' wrappers are removed."""
-    return njit(inline="always", **FAST)(inspect.unwrap(function))
+    return njit(forceinline=True, **_WITHIN, **FAST)(inspect.unwrap(function))
 
 
 def function(function):
     """Compile a function once."""
-    return njit(**FAST)(inspect.unwrap(function))
+    return njit(**_WITHIN, **FAST)(inspect.unwrap(function))
 
 
 def instruction(result) -> Any:
@@ -116,6 +118,13 @@ def _load(builder, address, kind, align=4):
 
 def _store(builder, value, address):
     builder.store(value, builder.inttoptr(address, value.type.as_pointer()), align=4)
+
+
+@instruction(types.int64)
+def call(builder, function, first, second, third):
+    """Call a C function by its address; one with fewer arguments ignores the rest."""
+    kind = ir.FunctionType(I64, [I64, I64, I64]).as_pointer()
+    return builder.call(builder.inttoptr(function, kind), [first, second, third])
 
 
 pointer = instruction(types.voidptr)(lambda builder, address: builder.inttoptr(address, I8.as_pointer()))
