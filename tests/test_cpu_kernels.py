@@ -197,7 +197,7 @@ def run_guarded(kernel, results, *buffers, at_end: bool):
     empty = [np.full(result.shape, np.nan, np.float32) for result in (results if many else [results])]
     arrays = [memory.copy(array, at_end) for array in (*given, *empty)]
     job = np.zeros(rows.BUFFERS + rows.PER_BUFFER * len(arrays), np.int64)
-    job[rows.PARTS], job[rows.LENGTH] = 5, len(job)
+    job[rows.PARTS] = 5
     dispatch._register()
     job[rows.ALLOCATE], job[rows.FREE] = dispatch._table[[ffi.ALLOCATE, ffi.FREE]]
     kinds = {"bool": simd.BOOL, "uint8": simd.UINT8, "uint16": simd.UINT16}

@@ -21,10 +21,8 @@ from .gather import (
     copy_pairs,
     fill_columns,
     fill_taps,
-    floats,
     gather_between,
     gather_row,
-    integers,
     lines_needed,
     padded,
     prefetch_rows,
@@ -34,8 +32,8 @@ from .gather import (
     taps_at,
     taps_size,
 )
-from .rows import FIRST, ONE, PARTS, ZERO
-from .simd import BOOL, WIDTH
+from .rows import FIRST, ONE, ZERO
+from .simd import BOOL, WIDTH, floats, integers
 
 # Lines for neighbouring voxels that reach the same pixels, which would wait for each other; so many are enough.
 LINES = 4
@@ -43,9 +41,8 @@ LINES = 4
 AHEAD = 2
 
 
-def gather(job_address, part, _):
+def gather(job, part, _):
     """Image to volume; a part is a band of rows of voxels."""
-    job = rows.job_at(job_address)
     tables, kind = rows.read_tables(job), rows.pixel_type(job, FIRST)
     limit2, has_image, bytes_each = tables.numbers[1], kind != BOOL, rows.pixel_bytes(kind)
     hole2 = rows.hole_limit2(tables)
@@ -54,7 +51,7 @@ def gather(job_address, part, _):
     # An image of ones is not read.
     tall, wide = (rows.size(job, FIRST, 0), rows.size(job, FIRST, 1)) if has_image else (2, 2)
     height, width = rows.size(job, FIRST + 1, 1), rows.size(job, FIRST + 1, 2)
-    top, bottom = part * height // job[PARTS], (part + 1) * height // job[PARTS]
+    top, bottom = part * height // rows.parts(job), (part + 1) * height // rows.parts(job)
     # Sums are kept in rows that begin where lines of the cache do.
     stride = rows.padded(width) + WIDTH
     many = depths * (bottom - top) * stride
@@ -114,16 +111,15 @@ def gather(job_address, part, _):
     return rows.free(job, memory)
 
 
-def scatter(job_address, part, _):
+def scatter(job, part, _):
     """Volume to image; a part is a band of rows of pixels."""
-    job = rows.job_at(job_address)
     tables = rows.read_tables(job)
     limit2 = tables.numbers[1]
     lenses, depths, ny = tables.y_pixel.shape
     nx = tables.x_pixel.shape[2]
     height, width = rows.size(job, FIRST, 1), rows.size(job, FIRST, 2)
     tall, wide = rows.size(job, FIRST + 1, 0), rows.size(job, FIRST + 1, 1)
-    top, bottom = part * tall // job[PARTS], (part + 1) * tall // job[PARTS]
+    top, bottom = part * tall // rows.parts(job), (part + 1) * tall // rows.parts(job)
     rows.fill(rows.address(job, FIRST + 1) + 4 * top * wide, (bottom - top) * wide, ZERO)
     space, length = padded(nx), rows.padded(wide + WIDTH)
     many = columns_size(nx) + taps_size(wide) + 3 * space + 3 * WIDTH + (1 + LINES) * length
@@ -195,9 +191,8 @@ def scatter(job_address, part, _):
     return rows.free(job, memory)
 
 
-def rays_vjp(job_address, part, _):
+def rays_vjp(job, part, _):
     """Image and volume to the gradient by the rays; a part is some of the lenses."""
-    job = rows.job_at(job_address)
     tables, kind = rows.read_tables(job), rows.pixel_type(job, FIRST)
     limit2, has_image, bytes_each = tables.numbers[1], kind != BOOL, rows.pixel_bytes(kind)
     lenses, depths, ny = tables.y_pixel.shape
@@ -225,7 +220,7 @@ def rays_vjp(job_address, part, _):
     x2, x_sums = floats(here.distance2, here.length), floats(at_x_sums, 2 * space)
     if not has_image:
         rows.fill(at_pairs, 2 * space, ONE)
-    for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
+    for lens in range(part * lenses // rows.parts(job), (part + 1) * lenses // rows.parts(job)):
         for d in range(depths):
             y_start, x_start = rows.patch(tables, lens, d, height, width)
             shift = x_start % WIDTH

@@ -8,7 +8,7 @@ import numpy as np
 
 from . import rows, simd
 from .gather import align
-from .rows import ONE, PARTS, ZERO
+from .rows import ONE, ZERO
 from .simd import WIDTH, inline
 
 # Bytes of sixteen numbers, and of a square of them.
@@ -22,10 +22,9 @@ def _within(row, column, side, tall, wide):
     return row >= 0 and column >= 0 and row + side + WIDTH < tall and column + side + WIDTH < wide
 
 
-def read_windows(job_address, part, _):
+def read_windows(job, part, _):
     """Image to windows `(row, column, lens)`, interpolated linearly; a part is a band of their rows."""
-    job = rows.job_at(job_address)
-    start, fraction = rows.integers(job, 0)[:, :, 0], rows.floats(job, 1)[:, :, 0]
+    start, fraction = rows.integer_rows(job, 0), rows.float_rows(job, 1)
     tall, wide = rows.size(job, 2, 0), rows.size(job, 2, 1)
     side, lenses = rows.size(job, 3, 0), rows.size(job, 3, 2)
     memory = rows.allocate(job, 2 * WIDTH * WIDTH)
@@ -34,7 +33,7 @@ def read_windows(job_address, part, _):
     at_rows = align(memory)
     at_columns = at_rows + _TILE
     for block in range(0, lenses, WIDTH):
-        for i in range(part * side // job[PARTS], (part + 1) * side // job[PARTS]):
+        for i in range(part * side // rows.parts(job), (part + 1) * side // rows.parts(job)):
             at_result = rows.address(job, 3) + 4 * (i * side * lenses + block)
             for j in range(0, side, WIDTH):
                 for n in range(WIDTH):
@@ -52,13 +51,12 @@ def read_windows(job_address, part, _):
     return rows.free(job, memory)
 
 
-def add_windows(job_address, part, _):
+def add_windows(job, part, _):
     """The adjoint of `read_windows`; a part is a band of rows of the image."""
-    job = rows.job_at(job_address)
-    start, fraction = rows.integers(job, 0)[:, :, 0], rows.floats(job, 1)[:, :, 0]
+    start, fraction = rows.integer_rows(job, 0), rows.float_rows(job, 1)
     side, lenses = rows.size(job, 2, 0), rows.size(job, 2, 2)
     tall, wide = rows.size(job, 3, 0), rows.size(job, 3, 1)
-    top, bottom = part * tall // job[PARTS], (part + 1) * tall // job[PARTS]
+    top, bottom = part * tall // rows.parts(job), (part + 1) * tall // rows.parts(job)
     rows.fill(rows.address(job, 3) + 4 * top * wide, (bottom - top) * wide, ZERO)
     # A row of each window, with zeros before and after it.
     length = rows.padded(side) + 3 * WIDTH
@@ -101,13 +99,12 @@ def add_windows(job_address, part, _):
     return rows.free(job, memory)
 
 
-def times_rows(job_address, part, _):
+def times_rows(job, part, _):
     """A sparse matrix (first entry of each row, columns, shares) times `(column, lens)`; a part is some rows."""
-    job = rows.job_at(job_address)
-    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
+    start, column, share = rows.integer_list(job, 0), rows.integer_list(job, 1), rows.float_list(job, 2)
     lenses, count = rows.size(job, 3, 1), rows.size(job, 4, 0)
     whole = lenses // (4 * WIDTH) * 4 * WIDTH
-    for row in range(part * count // job[PARTS], (part + 1) * count // job[PARTS]):
+    for row in range(part * count // rows.parts(job), (part + 1) * count // rows.parts(job)):
         begin, end = np.int64(start[row]), np.int64(start[row + 1])
         at_result = rows.address(job, 4) + 4 * row * lenses
         for lens in range(0, whole, 4 * WIDTH):
