@@ -42,7 +42,7 @@ from .report import write_report
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
 # Voxels of the words. Networks see planes between and beyond theirs; each step of a solver costs a hundred
 # back-projections, so that solvers have the planes of the words.
-_WORD_DEPTHS, _WORD_PLANES, _WORD_VOXEL_MM = np.arange(17.0, 23.01, 0.5), slice(2, 11, 4), 0.083
+_WORD_DEPTHS, _WORD_PLANES, _WORD_VOXEL_MM = np.arange(17.0, 23.01, 0.5), slice(2, 11, 4), 0.11
 _STEPS = 6
 # Voxels in which points are found.
 _POINT_DEPTHS, _POINT_VOXEL_MM = np.arange(17.0, 23.01, 0.5), 0.0415

@@ -8,6 +8,7 @@ axis. Over a ring of the field that is nearly a change of the magnification, whi
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -225,26 +226,38 @@ def _sharpest(rays: PupilSamples, fields, weight, chief: float, pitch: float) ->
     """Distortion at which the weighted mean of the spots, blurred, has the largest sum of squares."""
     # A spot with coma is brightest beside the middle of its light: by less than a pixel, which is 0.1 mm in depth.
     blur = np.random.default_rng(0).uniform(-_BLUR / 2, _BLUR / 2, rays.landing.shape) * pitch
-    rays = rays._replace(landing=rays.landing + blur, light=rays.light * weight[:, None])
     # Large pixels find the maximum as well as small ones.
     pitch = min(pitch, _SHARP * chief * float(np.max(fields)))
+    x, y = np.moveaxis(2 / pitch * (rays.landing + blur), -1, 0)
+    moved = np.broadcast_to(2 / pitch * chief * fields[:, None], x.shape)
+    all_rays = x, moved, y * y, rays.light * weight[:, None]
 
-    def cost(distortion, rays=rays):
+    def cost(distortion, x, moved, square, light):
+        # In place, as this takes most of the time of the tables.
+        place = distortion * moved
+        place += x
+        place *= place
+        place += square
+        np.sqrt(place, out=place)
         # Light is shared by two rings: counts of single rings would jump, and rounding would move the maximum.
-        place = (2 / pitch * _distance_from_core(rays, fields, chief * distortion)).ravel()
-        ring, light = place.astype(int), rays.light.ravel()
-        outer = light * (place - ring)
+        ring = place.astype(int)
+        place -= ring
+        place *= light
         count = ring.max() + 2
-        total = np.bincount(ring, light - outer, count) + np.bincount(ring + 1, outer, count)
+        total, outer = np.bincount(ring, light, count), np.bincount(ring, place, count)
+        total -= outer
+        total[1:] += outer[:-1]
         # Area under a ring's triangular weight; in the middle a cone.
         area = 2.0 * np.arange(count)
         area[0] = 1 / 3
         return -(total**2 / area).sum()
 
     tried = np.linspace(1 - _FARTHEST, 1 + _FARTHEST, _STEPS)
-    some = PupilSamples(*(part[:, ::_SPARSE] for part in rays))
-    best = int(np.argmin([cost(distortion, some) for distortion in tried]))
-    return _golden_section(cost, tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)])
+    some = [part[:, ::_SPARSE].ravel() for part in all_rays]
+    best = int(np.argmin([cost(distortion, *some) for distortion in tried]))
+    every = [part.ravel() for part in all_rays]
+    ends = tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)]
+    return _golden_section(lambda distortion: cost(distortion, *every), *ends)
 
 
 def _golden_section(cost: Callable[[float], float], low: float, high: float) -> float:
@@ -273,7 +286,14 @@ def sample_profile(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[
     """Points `(x, y)` in pixels whose density follows a core's profile."""
     order = np.arange(count) + 0.5
     edges = np.arange(profile.size + 1) / BINS
-    return vogel_spiral(np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2)), order)
+    radius = np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2))
+    return radius[:, None] * _directions(count)
+
+
+@lru_cache(maxsize=3)
+def _directions(count: int) -> Float64[np.ndarray, "point 2"]:
+    """Those of a spiral, the same for all profiles."""
+    return vogel_spiral(np.ones(count), np.arange(count) + 0.5)
 
 
 def harmonic_shares(
@@ -309,10 +329,17 @@ def render_harmonics(
 ) -> Float64[np.ndarray, "wave row column"]:
     """Kernels of a core's harmonics on such pixels as `render_kernel`'s, for each order a cosine's and a sine's."""
     points = sample_profile(profile, _SAMPLES // 8)
-    points = np.concatenate([points * sign for sign in np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])])
-    points = np.concatenate([points, points[:, ::-1]])
-    waves = [wave / len(points) for both in harmonic_shares(points, profile, harmonics) for wave in both]
-    return np.reshape(_on_pixels(points, waves, size, parts), (len(waves), size, size))
+    kernels = []
+    # The points, and those in the other seven octants: both waves change their signs, or each other's places.
+    for order, both in zip(HARMONICS, harmonic_shares(points, profile, harmonics), strict=False):
+        cosine, sine = (
+            wave + up * wave[::-1] + left * wave[:, ::-1] + up * left * wave[::-1, ::-1]
+            for wave, up, left in zip(
+                _on_pixels(points, both, size, parts), (1, -1), ((-1) ** order, -((-1) ** order)), strict=True
+            )
+        )
+        kernels += [cosine + sine.T, sine + cosine.T] if order % 2 else [cosine - cosine.T, sine + sine.T]
+    return np.reshape(kernels, (-1, size, size)) / _SAMPLES
 
 
 def _on_pixels(points, waves, size, parts):

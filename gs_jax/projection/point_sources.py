@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
 from ..base.machine import cpu_device
 from ..base.progress import Progress
 from ..base.typing import Points
-from ..microscope.geometry import Imager
+from ..base.workers import map_in_threads
+from ..microscope.geometry import FALLOFF, Imager
 from ..microscope.media import object_index
 from ..optics.field_varying import (
     CORE_REACH,
@@ -81,15 +81,16 @@ def make_stamps(
     half = STEPS // 2
     wide = np.pad(fine.reshape(-1, *fine.shape[-2:]), ((0, 0), (half, half), (half, half)), "wrap")
     # Pixels that begin at every fifth, along one axis after the other; a stamp that is moved up begins later.
-    for axis in (1, 2):
-        wide = sliding_window_view(wide, STEPS, axis).sum(-1)
+    for _ in range(2):
+        last = wide.shape[1] - STEPS + 1
+        wide = sum((wide[:, step : step + last] for step in range(1, STEPS)), wide[:, :last]).swapaxes(1, 2)
     pixels = wide.reshape(-1, size, STEPS, size, STEPS)[:, :, ::-1, :, ::-1]
     kernels = pixels.transpose(0, 2, 4, 1, 3).reshape(len(depths), -1, STEPS, STEPS, size, size)
     return Stamps(depths, np.ascontiguousarray(kernels), ring)
 
 
 def forward_points(
-    points: Points, imager: Imager, stamps: Stamps, progress: Progress | None = None
+    points: Points, imager: Imager, stamps: Stamps | Iterable[Stamps], progress: Progress | None = None
 ) -> Float[np.ndarray, "row column"]:
     """The image of points, Eq. (2), as `forward` computes it for voxels.
 
@@ -103,7 +104,7 @@ def forward_points(
     imager
         The microscope.
     stamps
-        PSF_o, or cores. Points beyond its depths take the nearest.
+        PSF_o, or the cores of each ring, of one size. Points beyond its depths take the nearest.
     progress
         Shows how many points are done.
 
@@ -115,18 +116,34 @@ def forward_points(
     # In order of depth, so that few stamps at a time are in use.
     points = np.asarray(points, np.float64)
     points = points[np.argsort(points[:, 2])]
+    progress, tiles = progress or Progress(), None
+    for part in [stamps] if isinstance(stamps, Stamps) else stamps:
+        tiles = _add_points(tiles, points, imager, part, progress)
+    assert tiles is not None
+    (rows, columns), overlap = _tiles(imager.sensor.shape, tiles.shape[-1] - _TILE + 1), tiles.shape[-1] - _TILE
+    image, side = np.zeros((rows * _TILE + overlap, columns * _TILE + overlap), tiles.dtype), tiles.shape[-1]
+    for tile, (row, column) in zip(np.asarray(tiles), np.ndindex(rows, columns), strict=True):
+        image[row * _TILE :, column * _TILE :][:side, :side] += tile
+    return image[overlap:, overlap:][: imager.sensor.shape[0], : imager.sensor.shape[1]]
+
+
+def _add_points(tiles: Array | None, points: Points, imager: Imager, stamps: Stamps, progress: Progress) -> Array:
+    """Add the spots of points to tiles, or begin them."""
     # Spots are added one after the other, which suits a CPU, also beside a GPU.
-    imager, depths, kernels = jax.device_put((imager, stamps.depths, stamps.kernels), cpu_device())
-    size = kernels.shape[-1]
-    rows, columns = _tiles(imager.sensor.shape, size)
-    side = _TILE + size - 1
-    tiles = jnp.zeros((rows * columns, side, side), kernels.dtype, device=kernels.device)
-    lenses, weight = KDTree(to_numpy(imager).centers), _weight(imager, stamps)
-    starts = range(0, len(points), _POINTS)
-    for start in (progress or Progress()).track(starts, "Imaging points"):
+    host, device = to_numpy(imager), cpu_device()
+    imager, depths, kernels = jax.device_put((imager, stamps.depths, stamps.kernels), device)
+    size, weight = kernels.shape[-1], _weight(imager, stamps)
+    if tiles is None:
+        rows, columns = _tiles(imager.sensor.shape, size)
+        tiles = jax.device_put(np.zeros((rows * columns, *2 * (_TILE + size - 1,)), kernels.dtype), device)
+    lenses, starts = KDTree(host.centers), range(0, len(points), _POINTS)
+    for start in progress.track(starts, "Imaging points"):
         batch = points[start : start + _POINTS]
-        lateral = batch[:, :2] - to_numpy(imager).axis_offset(batch[:, 2])
+        lateral = batch[:, :2] - host.axis_offset(batch[:, 2])
         pairs = KDTree(lateral).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
+        if stamps.ring:
+            # Those in the ring's hole have no light.
+            pairs = pairs[pairs["v"] >= stamps.ring.edges[0] * (1 - FALLOFF)]
         for first in range(0, len(pairs), _SPOTS):
             # Always as many, so that one shape is compiled; repetitions at the end are not added.
             spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
@@ -134,10 +151,7 @@ def forward_points(
             core = _core(batch[:, 2], imager, stamps)
             spot_arguments = (batch[spots["i"]], spots["j"], *(part[spots["i"]] for part in core))
             tiles = _add_spots(tiles, count, *spot_arguments, imager, depths, kernels, weight)
-    image = np.zeros((rows * _TILE + size - 1, columns * _TILE + size - 1), stamps.kernels.dtype)
-    for tile, (row, column) in zip(np.asarray(tiles), np.ndindex(rows, columns), strict=True):
-        image[row * _TILE :, column * _TILE :][:side, :side] += tile
-    return image[size - 1 :, size - 1 :][: imager.sensor.shape[0], : imager.sensor.shape[1]]
+    return tiles
 
 
 def _tiles(shape: tuple[int, int], size: int) -> tuple[int, int]:
@@ -268,16 +282,16 @@ def _trace(points, imager: Imager, progress: Progress | None) -> _FullOptics:
 
 
 def _stamps_of_rings(imager: Imager, depths, tables: PsfCores, size: int) -> Iterator[Stamps]:
+    shapes = STEPS * size, STEPS
+
+    def render(core):
+        kernel, waves = render_kernel(core[0], *shapes), render_harmonics(*core, *shapes)
+        return np.concatenate([kernel[None], waves]).astype(np.float32)
+
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
-    for edges, *parts, profiles, harmonics in rings:
-        shapes = STEPS * size, STEPS
-        kernels = np.stack(
-            [
-                np.concatenate([render_kernel(profile, *shapes)[None], render_harmonics(profile, waves, *shapes)])
-                for profile, waves in zip(profiles, harmonics, strict=True)
-            ]
-        )
-        yield make_stamps(depths, kernels.astype(np.float32), Ring(edges, *parts))
+    for edges, distortion, light, *cores in rings:
+        kernels = np.stack(list(map_in_threads(render, zip(*cores, strict=True))))
+        yield make_stamps(depths, kernels, Ring(edges, distortion, light))
 
 
 def _full_image(points, imager: Imager, optics: _FullOptics, progress: Progress | None = None) -> np.ndarray:
@@ -285,8 +299,7 @@ def _full_image(points, imager: Imager, optics: _FullOptics, progress: Progress 
     nodes = jnp.asarray(_to_nodes(points, optics.depths, stray_light.grid), imager.sensor_distance.dtype)
     planes = jnp.asarray(optics.depths, nodes.dtype)
     image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))
-    for stamps in optics.stamps:
-        image += forward_points(points, imager, stamps, progress)
+    image += forward_points(points, imager, optics.stamps, progress)
     # The stray light ripples below zero in places; clipping adds light, which scaling removes.
     clipped = np.maximum(image, 0)
     return clipped * (image.sum() / max(clipped.sum(), np.finfo(image.dtype).tiny))

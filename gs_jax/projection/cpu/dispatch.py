@@ -70,7 +70,7 @@ def _number(name):
 @cache
 def _register():
     idle = ctypes.windll.kernel32.SwitchToThread if sys.platform == "win32" else ctypes.CDLL(None).sched_yield
-    functions = (ctypes.pythonapi.PyMem_RawMalloc, ctypes.pythonapi.PyMem_RawFree, idle)
+    functions = (ctypes.pythonapi.PyMem_RawCalloc, ctypes.pythonapi.PyMem_RawFree, idle)
     for place, function in zip((ffi.ALLOCATE, ffi.FREE, ffi.YIELD), functions, strict=True):
         _table[place] = ctypes.cast(function, ctypes.c_void_p).value or 0
     if sys.platform == "linux":

@@ -5,12 +5,12 @@ XLA's own threads nothing waits for a second pool, several programs may run at o
 The calling thread works too, so that the call ends even if no other thread is free.
 """
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 
-from .rows import BUFFERS, DONE, LENGTH, OWN, PARTS, PER_BUFFER
-from .simd import I64, carray, inline, instruction, pointer
+from . import rows
+from .rows import BUFFERS, DONE, OWN, PARTS, PER_BUFFER
+from .simd import I64, call, inline, instruction, load_long as get, store_long as put
 
 # Places in structures, in units of 8 bytes.
 EXTENSION, API, CONTEXT, ARGUMENTS, RESULTS, ATTRIBUTES = 1, 2, 3, 5, 10, 20  # of the frame
@@ -21,7 +21,7 @@ METADATA, TABLE = 1, 77  # types of extensions: XLA's, and our own, which tells 
 # Places in the table: addresses of functions, the version, addresses of an error's arguments and of the kernels.
 TASK, ALLOCATE, FREE, YIELD, ADVISE, MAJOR, MINOR, NO_MEMORY, FIRST_KERNEL = range(9)
 # Places in a job, besides its parts, length and buffers.
-_REFERENCES, _NEXT, _DONE, _KERNEL, _FREE, _FAILED = 0, 1, 2, 4, 5, 7
+_REFERENCES, _NEXT, _DONE, _KERNEL, _FAILED = 0, 1, 2, 4, 7
 
 
 @instruction(types.int64)
@@ -40,110 +40,110 @@ def _fetch_add(builder, address, number):
     return builder.atomic_rmw("add", builder.inttoptr(address, I64.as_pointer()), number, "seq_cst")
 
 
-@instruction(types.int64)
-def _call(builder, function, first, second, third):
-    """Call a C function by its address; one with fewer arguments ignores the rest."""
-    kind = ir.FunctionType(I64, [I64, I64, I64]).as_pointer()
-    return builder.call(builder.inttoptr(function, kind), [first, second, third])
-
-
 @inline
-def _at(address, length):
-    return carray(pointer(address), length, np.int64)
-
-
-@inline
-def _work(address):
+def _work(job):
     """Take parts until none is left."""
-    job = _at(address, OWN)
     while True:
-        part = _fetch_add(address + 8 * _NEXT, 1)
-        if part >= job[PARTS]:
+        part = _fetch_add(job + 8 * _NEXT, 1)
+        if part >= get(job, PARTS):
             return
-        if _call(job[_KERNEL], address, part, 0) != DONE:
-            _fetch_add(address + 8 * _FAILED, 1)
-        _fetch_add(address + 8 * _DONE, 1)
+        if call(get(job, _KERNEL), job, part, 0) != DONE:
+            _fetch_add(job + 8 * _FAILED, 1)
+        _fetch_add(job + 8 * _DONE, 1)
 
 
 @inline
-def _release(address):
-    if _fetch_add(address + 8 * _REFERENCES, -1) == 1:
-        _call(_at(address, OWN)[_FREE], address, 0, 0)
+def _release(job):
+    if _fetch_add(job + 8 * _REFERENCES, -1) == 1:
+        call(get(job, rows.FREE), job, 0, 0)
 
 
-def task(address, _):
+def task(job, _):
     """The work of a helping thread, which may start when all is done."""
-    _work(address)
-    _release(address)
+    _work(job)
+    _release(job)
     return 0
 
 
 @inline
 def _list_buffers(job, first, items):
     """Write the buffers of a frame's arguments or results to the job; returns the number of the next buffer."""
-    for number in range(items[COUNT]):
-        place = BUFFERS + PER_BUFFER * (first + number)
-        buffer = _at(_at(items[ITEMS], items[COUNT])[number], 6)
-        job[place], job[place + 1] = buffer[3], buffer[2] & 0xFFFFFFFF
+    for number in range(get(items, COUNT)):
+        place, buffer = BUFFERS + PER_BUFFER * (first + number), get(get(items, ITEMS), number)
+        put(job, place, get(buffer, 3))
+        put(job, place + 1, get(buffer, 2) & 0xFFFFFFFF)
         for axis in range(3):
-            job[place + 2 + axis] = _at(buffer[5], 3)[axis] if axis < buffer[4] else 1
-    return first + items[COUNT]
+            put(job, place + 2 + axis, get(get(buffer, 5), axis) if axis < get(buffer, 4) else 1)
+    return first + get(items, COUNT)
 
 
 @inline
-def _use_large_pages(job, place, advise):
+def _put_four(at, size, third, fourth):
+    """Begin a structure of XLA: its size, no extension, and two numbers."""
+    put(at, 0, size)
+    put(at, 1, 0)
+    put(at, 2, third)
+    put(at, 3, fourth)
+
+
+@inline
+def _use_large_pages(job, result, advise):
     """For a result: to map 100 MB in small pages takes half as long as a kernel."""
-    page = 2**21
-    first = (job[place] + page - 1) // page * page
-    pages = (job[place] + 4 * job[place + 2] * job[place + 3] * job[place + 4] - first) // page
+    page, start = 2**21, rows.address(job, result)
+    first = (start + page - 1) // page * page
+    size = 4 * rows.size(job, result, 0) * rows.size(job, result, 1) * rows.size(job, result, 2)
+    pages = (start + size - first) // page
     if advise != 0 and pages > 1:
-        _call(advise, first, pages * page, 14)  # MADV_HUGEPAGE
+        call(advise, first, pages * page, 14)  # MADV_HUGEPAGE
 
 
-def handle(frame_address, _):
+def handle(frame, _):
     """The handler that XLA calls."""
-    frame, at_table = _at(frame_address, 21), _at(_global(), 1)[0]
-    table = _at(at_table, FIRST_KERNEL)
-    if frame[EXTENSION] != 0:
-        extension = _at(frame[EXTENSION], 4)
-        if extension[1] & 0xFFFFFFFF == METADATA:
-            version = carray(pointer(extension[3] + 24), 2, np.int32)
-            version[0], version[1] = table[MAJOR], table[MINOR]
+    table = get(_global(), 0)
+    if get(frame, EXTENSION) != 0:
+        extension = get(frame, EXTENSION)
+        if get(extension, 1) & 0xFFFFFFFF == METADATA:
+            # Two numbers of 32 bits.
+            put(get(extension, 3), 3, get(table, MAJOR) | get(table, MINOR) << 32)
             return 0
-        if extension[1] & 0xFFFFFFFF == TABLE:
-            _at(_global(), 1)[0] = extension[3]
+        if get(extension, 1) & 0xFFFFFFFF == TABLE:
+            put(_global(), 0, get(extension, 3))
             return 0
-    api = _at(frame[API], 19)
-    length = BUFFERS + PER_BUFFER * (frame[ARGUMENTS + COUNT] + frame[RESULTS + COUNT])
-    address = _call(table[ALLOCATE], 8 * length, 0, 0)
-    if address == 0:
-        return _call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0)
-    job = _at(address, length)
-    attributes = _at(frame[ATTRIBUTES], 2)
-    which, parts = _at(_at(attributes[0], 2)[1], 1)[0], _at(_at(attributes[1], 2)[1], 1)[0]
-    job[_REFERENCES], job[_NEXT], job[_DONE], job[PARTS], job[LENGTH], job[_FAILED] = 1, 0, 0, parts, length, 0
-    job[_KERNEL], job[_FREE] = _at(at_table + 8 * FIRST_KERNEL, which + 1)[which], table[FREE]
-    arguments = _list_buffers(job, 0, frame[ARGUMENTS : ARGUMENTS + 5])
-    for result in range(arguments, _list_buffers(job, arguments, frame[RESULTS : RESULTS + 5])):
-        _use_large_pages(job, BUFFERS + PER_BUFFER * result, table[ADVISE])
+    api, context = get(frame, API), get(frame, CONTEXT)
+    length = BUFFERS + PER_BUFFER * (get(frame, ARGUMENTS + COUNT) + get(frame, RESULTS + COUNT))
+    job = call(get(table, ALLOCATE), length, 8, 0)
+    if job == 0:
+        return call(get(api, ERROR_CREATE), get(table, NO_MEMORY), 0, 0)
+    attributes = get(frame, ATTRIBUTES)
+    kernel, parts = get(get(get(attributes, 0), 1), 0), get(get(get(attributes, 1), 1), 0)
+    put(job, _REFERENCES, 1)
+    put(job, PARTS, parts)
+    put(job, _KERNEL, get(table, FIRST_KERNEL + kernel))
+    put(job, rows.ALLOCATE, get(table, ALLOCATE))
+    put(job, rows.FREE, get(table, FREE))
+    first = _list_buffers(job, 0 * length, frame + 8 * ARGUMENTS)
+    for result in range(first, _list_buffers(job, first, frame + 8 * RESULTS)):
+        _use_large_pages(job, result, get(table, ADVISE))
     # XLA reads and writes the structures of its functions here.
-    scratch, at_scratch, threads = job[OWN:BUFFERS], address + 8 * OWN, address + 8 * (OWN + 8)
-    scratch[0], scratch[1], scratch[2], scratch[3], scratch[8] = 32, 0, frame[CONTEXT], threads, 1
-    error = _call(api[THREADS], at_scratch, 0, 0)
-    for _ in range(min(scratch[8], parts) - 1):
+    scratch, threads = job + 8 * OWN, job + 8 * (OWN + 8)
+    put(threads, 0, 1)
+    _put_four(scratch, 32, context, threads)
+    error = call(get(api, THREADS), scratch, 0, 0)
+    for _ in range(min(get(threads, 0), parts) - 1):
         if error != 0:
             break
-        _fetch_add(address + 8 * _REFERENCES, 1)
-        scratch[0], scratch[1], scratch[2], scratch[3], scratch[4] = 40, 0, frame[CONTEXT], table[TASK], address
-        error = _call(api[SCHEDULE], at_scratch, 0, 0)
+        _fetch_add(job + 8 * _REFERENCES, 1)
+        _put_four(scratch, 40, context, get(table, TASK))
+        put(scratch, 4, job)
+        error = call(get(api, SCHEDULE), scratch, 0, 0)
         if error != 0:
-            _fetch_add(address + 8 * _REFERENCES, -1)
+            _fetch_add(job + 8 * _REFERENCES, -1)
     if error != 0:  # no threads: all is done here
-        scratch[0], scratch[1], scratch[2] = 24, 0, error
-        _call(api[ERROR_DESTROY], at_scratch, 0, 0)
-    _work(address)
-    while _fetch_add(address + 8 * _DONE, 0) < parts:
-        _call(table[YIELD], 0, 0, 0)
-    failed = job[_FAILED] > 0
-    _release(address)
-    return _call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0) if failed else 0
+        _put_four(scratch, 24, error, 0)
+        call(get(api, ERROR_DESTROY), scratch, 0, 0)
+    _work(job)
+    while _fetch_add(job + 8 * _DONE, 0) < parts:
+        call(get(table, YIELD), 0, 0, 0)
+    failed = get(job, _FAILED) > 0
+    _release(job)
+    return call(get(api, ERROR_CREATE), get(table, NO_MEMORY), 0, 0) if failed else 0

@@ -9,7 +9,8 @@ stays transposed; its frequencies stay in the order in which the transform leave
 import numpy as np
 
 from . import rows, simd
-from .rows import BUFFERS, HALF, PARTS, PER_BUFFER, ZERO
+from .gather import align
+from .rows import BUFFERS, HALF, PER_BUFFER, ZERO
 from .simd import WIDTH, function, inline
 
 # Buffers: a plan, cosines and sines, spectra; images follow, and sums of them.
@@ -19,25 +20,24 @@ _STEP = 4 * WIDTH
 _SIN_60 = np.float32(np.sqrt(0.75))
 
 
-def overlap_save(job_address, part, _):
+def overlap_save(job, part, _):
     """Images to sums of their convolutions, or one image to its convolutions; a part is some of the pairs of tiles."""
-    job = rows.job_at(job_address)
     # A sum's pixel i starts to read an image at i + shift; a tile gives `kept` pixels each way.
-    plan = rows.integers(job, _PLAN)[:, 0, 0]
+    plan = rows.integer_list(job, _PLAN)
     images, sums, shift, kept = np.int64(plan[0]), np.int64(plan[1]), np.int64(plan[2]), np.int64(plan[3])
     turns, side = rows.address(job, _TURNS), rows.size(job, _TURNS, 0)
     strip = 2 * plane_bytes(side)
     tile = strip * (side // WIDTH)
-    scratch = np.empty(3 * tile // 4 + WIDTH, np.float32)
-    edge = np.zeros(WIDTH, np.float32)
-    at_edge = np.int64(edge.ctypes.data)
-    at_tile = (np.int64(scratch.ctypes.data) + _STEP - 1) // _STEP * _STEP
-    at_sum, at_last = at_tile + tile, at_tile + 2 * tile
+    memory = rows.allocate(job, 3 * tile // 4 + WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_tile = align(memory)
+    at_sum, at_last, at_edge = at_tile + tile, at_tile + 2 * tile, at_tile + 3 * tile
     tall, wide = rows.size(job, _IMAGES + images, 0), rows.size(job, _IMAGES + images, 1)
     across = (wide + kept - 1) // kept
     tiles = (tall + kept - 1) // kept * across
     pairs = (tiles + 1) // 2
-    for pair in range(part * pairs // job[PARTS], (part + 1) * pairs // job[PARTS]):
+    for pair in range(part * pairs // rows.parts(job), (part + 1) * pairs // rows.parts(job)):
         # The last may have no second, which then lies below the image.
         one, two = 2 * pair, 2 * pair + 1
         row1, column1 = kept * (one // across), kept * (one % across)
@@ -71,7 +71,7 @@ def overlap_save(job_address, part, _):
                     transform_back(at_last + strip * s, side, turns)
             _write(job, place, row1, column1, at_last, side, kept, fresh, at_edge)
             _write(job, place, row2, column2, at_last + plane_bytes(side), side, kept, fresh, at_edge)
-    return rows.keep_alive((scratch, edge))
+    return rows.free(job, memory)
 
 
 @inline
@@ -83,11 +83,11 @@ def plane_bytes(side):
 @function
 def _read(job, place, row, column, at, side, at_edge):
     """Copy a tile of an image, zero beyond it, to one plane of the strips; returns whether any pixel is not zero."""
-    tall, wide, strip = job[place + 2], job[place + 3], 2 * plane_bytes(side)
+    tall, wide, strip = simd.load_long(job, place + 2), simd.load_long(job, place + 3), 2 * plane_bytes(side)
     inside, seen = column >= 0 and column + side <= wide, simd.zeros()
     for y in range(side):
         exists = row + y >= 0 and row + y < tall
-        source, target = job[place] + 4 * ((row + y) * wide + column), at + _STEP * y
+        source, target = simd.load_long(job, place) + 4 * ((row + y) * wide + column), at + _STEP * y
         for s in range(side // WIDTH):
             value = simd.zeros()
             if exists and inside:
@@ -111,9 +111,9 @@ def _load_some(address, column, wide, at_edge):
 @function
 def _write(job, place, row, column, at, side, kept, dark, at_edge):
     """Copy what is kept of a tile from one plane of the strips to an image."""
-    tall, wide, strip = job[place + 2], job[place + 3], 2 * plane_bytes(side)
+    tall, wide, strip = simd.load_long(job, place + 2), simd.load_long(job, place + 3), 2 * plane_bytes(side)
     for y in range(min(kept, tall - row)):
-        source, target = at + _STEP * y, job[place] + 4 * ((row + y) * wide + column)
+        source, target = at + _STEP * y, simd.load_long(job, place) + 4 * ((row + y) * wide + column)
         for s in range(kept // WIDTH):
             value = simd.zeros() if dark else simd.load(source + strip * s)
             left = wide - column - WIDTH * s

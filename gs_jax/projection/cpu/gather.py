@@ -11,7 +11,7 @@ import numpy as np
 
 from . import rows, simd
 from .rows import FAR, ONE, ZERO
-from .simd import WIDTH, carray, inline
+from .simd import WIDTH, floats, inline, integers
 
 # The most voxels of a row that may reach a pixel, and the most pixels of a window.
 MOST_TAPS, WIDEST = 4, 4 * WIDTH
@@ -27,15 +27,12 @@ class Columns(NamedTuple):
     length: int  # number of columns, with the padding of their blocks
 
 
-# So many zeros from `align` on.
-scratch = inline(lambda count: np.zeros(count + WIDTH, np.float32))
-align = inline(lambda numbers: (np.int64(numbers.ctypes.data) + 4 * WIDTH - 1) // (4 * WIDTH) * (4 * WIDTH))
+# Where a line of the cache begins.
+align = inline(lambda at: (at + 4 * WIDTH - 1) // (4 * WIDTH) * (4 * WIDTH))
 # The most columns in a patch's blocks, and the numbers of `Columns` and `Taps`.
 padded = inline(lambda nx: rows.padded(nx + WIDTH))
 columns_size = inline(lambda nx: 4 * padded(nx))
 taps_size = inline(lambda pixels: (3 + MOST_TAPS) * (rows.padded(pixels) + WIDTH))
-integers = inline(lambda at, length: carray(simd.pointer(at), length, np.int32))
-floats = inline(lambda at, length: carray(simd.pointer(at), length, np.float32))
 
 
 @inline

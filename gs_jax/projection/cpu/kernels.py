@@ -21,22 +21,19 @@ from .gather import (
     copy_pairs,
     fill_columns,
     fill_taps,
-    floats,
     gather_between,
     gather_row,
-    integers,
     lines_needed,
     padded,
     prefetch_rows,
-    scratch,
     set_windows,
     sum_taps,
     take_sum,
     taps_at,
     taps_size,
 )
-from .rows import FIRST, ONE, PARTS, ZERO
-from .simd import BOOL, WIDTH
+from .rows import FIRST, ONE, ZERO
+from .simd import BOOL, WIDTH, floats, integers
 
 # Lines for neighbouring voxels that reach the same pixels, which would wait for each other; so many are enough.
 LINES = 4
@@ -44,9 +41,8 @@ LINES = 4
 AHEAD = 2
 
 
-def gather(job_address, part, _):
+def gather(job, part, _):
     """Image to volume; a part is a band of rows of voxels."""
-    job = rows.job_at(job_address)
     tables, kind = rows.read_tables(job), rows.pixel_type(job, FIRST)
     limit2, has_image, bytes_each = tables.numbers[1], kind != BOOL, rows.pixel_bytes(kind)
     hole2 = rows.hole_limit2(tables)
@@ -54,18 +50,21 @@ def gather(job_address, part, _):
     nx = tables.x_pixel.shape[2]
     # An image of ones is not read.
     tall, wide = (rows.size(job, FIRST, 0), rows.size(job, FIRST, 1)) if has_image else (2, 2)
-    volume = rows.floats(job, FIRST + 1)
-    height, width = volume.shape[1:]
-    top, bottom = part * height // job[PARTS], (part + 1) * height // job[PARTS]
+    height, width = rows.size(job, FIRST + 1, 1), rows.size(job, FIRST + 1, 2)
+    top, bottom = part * height // rows.parts(job), (part + 1) * height // rows.parts(job)
     # Sums are kept in rows that begin where lines of the cache do.
     stride = rows.padded(width) + WIDTH
-    sums, lines = scratch(depths * (bottom - top) * stride), scratch(columns_size(nx) + 2 * padded(nx) + wide + WIDTH)
-    at_sums, at_lines = align(sums), align(lines)
+    many = depths * (bottom - top) * stride
+    memory = rows.allocate(job, many + columns_size(nx) + 2 * padded(nx) + wide + WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_sums = align(memory)
+    at_lines = at_sums + 4 * many
     at_pairs = at_lines + 4 * columns_size(nx)
     at_blended, here = at_pairs + 8 * padded(nx), columns_at(at_lines, nx)
     x2 = floats(here.distance2, here.length)
     if not has_image:
-        floats(at_pairs, 2 * here.length)[:] = ONE
+        rows.fill(at_pairs, 2 * here.length, ONE)
     for lens in range(lenses):
         for d in range(depths):
             y_start, x_start = rows.patch(tables, lens, d, height, width)
@@ -105,25 +104,29 @@ def gather(job_address, part, _):
                     simd.store(at_row + 4 * c, simd.load(at_row + 4 * c) + value)
     for d in range(depths):
         for k in range(bottom - top):
-            volume[d, top + k] = floats(at_sums + 4 * (d * (bottom - top) + k) * stride, width)
-    return rows.keep_alive((sums, lines))
+            row = floats(at_sums + 4 * (d * (bottom - top) + k) * stride, width)
+            target = floats(rows.address(job, FIRST + 1) + 4 * (d * height + top + k) * width, width)
+            for column in range(width):
+                target[column] = row[column]
+    return rows.free(job, memory)
 
 
-def scatter(job_address, part, _):
+def scatter(job, part, _):
     """Volume to image; a part is a band of rows of pixels."""
-    job = rows.job_at(job_address)
     tables = rows.read_tables(job)
     limit2, hole2 = tables.numbers[1], rows.hole_limit2(tables)
     lenses, depths, ny = tables.y_pixel.shape
     nx = tables.x_pixel.shape[2]
     height, width = rows.size(job, FIRST, 1), rows.size(job, FIRST, 2)
-    image = rows.floats(job, FIRST + 1)[:, :, 0]
-    tall, wide = image.shape
-    top, bottom = part * tall // job[PARTS], (part + 1) * tall // job[PARTS]
-    image[top:bottom] = ZERO
+    tall, wide = rows.size(job, FIRST + 1, 0), rows.size(job, FIRST + 1, 1)
+    top, bottom = part * tall // rows.parts(job), (part + 1) * tall // rows.parts(job)
+    rows.fill(rows.address(job, FIRST + 1) + 4 * top * wide, (bottom - top) * wide, ZERO)
     space, length = padded(nx), rows.padded(wide + WIDTH)
-    lines = scratch(columns_size(nx) + taps_size(wide) + 3 * space + 3 * WIDTH + (1 + LINES) * length)
-    at_columns = align(lines)
+    many = columns_size(nx) + taps_size(wide) + 3 * space + 3 * WIDTH + (1 + LINES) * length
+    memory = rows.allocate(job, many)
+    if memory == 0:
+        return rows.FAILED
+    at_columns = align(memory)
     at_taps = at_columns + 4 * columns_size(nx)
     at_pairs = at_taps + 4 * taps_size(wide)
     at_spare = at_pairs + 8 * space  # a row of pixels that belongs to another part goes here and is not read
@@ -196,12 +199,11 @@ def scatter(job_address, part, _):
                     spread = take_sum(at_lines + j, many, 4 * length)
                     simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * spread)
                     simd.store(at_lower + j, simd.load(at_lower + j) + down * spread)
-    return rows.keep_alive((lines,))
+    return rows.free(job, memory)
 
 
-def rays_vjp(job_address, part, _):
+def rays_vjp(job, part, _):
     """Image and volume to the gradient by the rays; a part is some of the lenses."""
-    job = rows.job_at(job_address)
     tables, kind = rows.read_tables(job), rows.pixel_type(job, FIRST)
     limit2, has_image, bytes_each = tables.numbers[1], kind != BOOL, rows.pixel_bytes(kind)
     lenses, depths, ny = tables.y_pixel.shape
@@ -212,8 +214,10 @@ def rays_vjp(job_address, part, _):
     x_fraction_sums, x_distance2_sums = rows.floats(job, FIRST + 4), rows.floats(job, FIRST + 5)
     parameters_sums = rows.floats(job, FIRST + 6)  # of each lens
     many, space, length = parameters_sums.shape[2], padded(nx), rows.padded(wide + WIDTH)
-    lines = scratch(columns_size(nx) + 6 * space + 2 * length + many * WIDTH + WIDTH)
-    at_columns = align(lines)
+    memory = rows.allocate(job, columns_size(nx) + 6 * space + 2 * length + many * WIDTH + WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_columns = align(memory)
     at_x_sums = at_columns + 4 * columns_size(nx)
     at_x2_sums = at_x_sums + 4 * space
     # Of two pixels: their values, and their derivatives along y, which are zero for an image of ones.
@@ -225,17 +229,17 @@ def rays_vjp(job_address, part, _):
     at_edge = at_sums + 4 * many * WIDTH
     here = columns_at(at_columns, nx)
     x2, x_sums = floats(here.distance2, here.length), floats(at_x_sums, 2 * space)
-    sums = floats(at_sums, many * WIDTH)
     if not has_image:
-        floats(at_pairs, 2 * space)[:] = ONE
-    for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
+        rows.fill(at_pairs, 2 * space, ONE)
+    for lens in range(part * lenses // rows.parts(job), (part + 1) * lenses // rows.parts(job)):
         for d in range(depths):
             y_start, x_start = rows.patch(tables, lens, d, height, width)
             shift = x_start % WIDTH
             fill_columns(here, job, tables, lens, d, shift, wide)
             size = set_windows(here, shift, nx, wide) if has_image else 0
             begin, end = shift, shift + nx
-            x_sums[:], sums[:] = ZERO, ZERO
+            rows.fill(at_x_sums, 2 * space, ZERO)
+            rows.fill(at_sums, many * WIDTH, ZERO)
             for k in range(ny):
                 y2 = tables.y_distance2[lens, d, k]
                 y_fraction_sums[lens, d, k], y_distance2_sums[lens, d, k] = ZERO, ZERO
@@ -283,5 +287,5 @@ def rays_vjp(job_address, part, _):
                 x_fraction_sums[lens, d, c] = x_sums[shift + c]
                 x_distance2_sums[lens, d, c] = x_sums[space + shift + c]
             for number in range(many):
-                parameters_sums[lens, d, number] = sums[WIDTH * number : WIDTH * number + WIDTH].sum()
-    return rows.keep_alive((lines,))
+                parameters_sums[lens, d, number] = simd.total(simd.load(at_sums + 4 * WIDTH * number))
+    return rows.free(job, memory)

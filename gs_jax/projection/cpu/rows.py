@@ -3,17 +3,18 @@
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 
 from . import simd
-from .simd import WIDTH, carray, inline
+from .simd import I64, WIDTH, inline, instruction
 
 # A job is a list of 64-bit numbers: eight of its own, sixteen for arguments of XLA's functions, then address, type and
 # three sizes of each buffer.
-PARTS, LENGTH, OWN, BUFFERS, PER_BUFFER = 3, 6, 8, 24, 5
+PARTS, FREE, ALLOCATE, OWN, BUFFERS, PER_BUFFER = 3, 5, 6, 8, 24, 5
 # Buffers: numbers of the weight, its parameters, start, pixel, fraction and distance2 of y and of x, and what follows.
 FIRST = 10
-# What kernels return. One that fails, because there is no memory for its scratch, returns 0.
-DONE = 1
+# What kernels return: `FAILED` if there is no memory for their scratch.
+DONE, FAILED = 1, 0
 ZERO, HALF, ONE, TWO, THREE, SIX, FAR = (np.float32(n) for n in (0, 0.5, 1, 2, 3, 6, 1e8))
 
 
@@ -32,28 +33,63 @@ class Tables(NamedTuple):
     x_distance2: np.ndarray
 
 
-address = inline(lambda job, buffer: job[BUFFERS + PER_BUFFER * buffer])
-pixel_type = inline(lambda job, buffer: job[BUFFERS + PER_BUFFER * buffer + 1])
-size = inline(lambda job, buffer, axis: job[BUFFERS + PER_BUFFER * buffer + 2 + axis])
-shape = inline(lambda job, buffer: (size(job, buffer, 0), size(job, buffer, 1), size(job, buffer, 2)))
-floats = inline(lambda job, buffer: carray(simd.pointer(address(job, buffer)), shape(job, buffer), np.float32))
-integers = inline(lambda job, buffer: carray(simd.pointer(address(job, buffer)), shape(job, buffer), np.int32))
+def _place(builder, buffer, number):
+    return builder.add(builder.mul(buffer, I64(PER_BUFFER)), I64(BUFFERS + number))
+
+
+def _entry(builder, job, buffer, number):
+    return simd.load_number(builder, job, _place(builder, buffer, number))
+
+
+def _array_of(dtype, axes):
+    """Make a function of a job and a buffer that returns the buffer as an array of its first axes."""
+
+    def emit(builder, job, buffer):
+        return _entry(builder, job, buffer, 0), [_entry(builder, job, buffer, 2 + axis) for axis in range(axes)]
+
+    return instruction(types.Array(dtype, axes, "C"))(emit)
+
+
+# Not functions of numba, which would be compiled for each number that they are called with.
+parts = instruction(types.int64)(lambda builder, job: simd.load_number(builder, job, I64(PARTS)))
+address = instruction(types.int64)(lambda builder, job, buffer: _entry(builder, job, buffer, 0))
+pixel_type = instruction(types.int64)(lambda builder, job, buffer: _entry(builder, job, buffer, 1))
+size = instruction(types.int64)(
+    lambda builder, job, buffer, axis: simd.load_number(builder, job, builder.add(_place(builder, buffer, 2), axis))
+)
+floats, integers = _array_of(types.float32, 3), _array_of(types.int32, 3)
+float_rows, integer_rows = _array_of(types.float32, 2), _array_of(types.int32, 2)
+float_list, integer_list = _array_of(types.float32, 1), _array_of(types.int32, 1)
 padded = inline(lambda count: (count + WIDTH - 1) // WIDTH * WIDTH)
 pixel_bytes = inline(lambda kind: 1 if kind == simd.UINT8 else 2 if kind == simd.UINT16 else 4)
 
 
 @inline
-def job_at(address):
-    own = carray(simd.pointer(address), OWN, np.int64)
-    return carray(simd.pointer(address), own[LENGTH], np.int64)
+def allocate(job, count):
+    """The address of so many zeros (float32) from `align` on; 0 if there is no memory for them."""
+    return simd.call(simd.load_long(job, ALLOCATE), count + WIDTH, 4, 0)
+
+
+@inline
+def free(job, at):
+    """Free what `allocate` returned. Returns `DONE`."""
+    simd.call(simd.load_long(job, FREE), at, 0, 0)
+    return DONE
+
+
+@inline
+def fill(at, count, number):
+    values = simd.floats(at, count)
+    for n in range(count):
+        values[n] = number
 
 
 @inline
 def read_tables(job):
     return Tables(
-        floats(job, 0)[:, 0, 0], floats(job, 1)[:, :, 0],
-        integers(job, 2)[:, :, 0], integers(job, 3), floats(job, 4), floats(job, 5),
-        integers(job, 6)[:, :, 0], integers(job, 7), floats(job, 8), floats(job, 9),
+        float_list(job, 0), float_rows(job, 1),
+        integer_rows(job, 2), integers(job, 3), floats(job, 4), floats(job, 5),
+        integer_rows(job, 6), integers(job, 7), floats(job, 8), floats(job, 9),
     )  # fmt: skip
 
 
@@ -220,11 +256,3 @@ def first_below(pixel, limit):
         else:
             low = middle + 1
     return low
-
-
-@inline
-def keep_alive(arrays):
-    """Numba frees an array after its last use, and does not count the use of its address. Returns `DONE`."""
-    for array in arrays:
-        array[0] = ZERO
-    return DONE

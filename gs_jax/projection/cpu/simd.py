@@ -9,10 +9,11 @@ import operator
 from typing import Any
 
 from llvmlite import ir
-from numba import carray as _carray, extending, njit, types  # pyright: ignore[reportPrivateImportUsage]
+from numba import extending, njit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.core import config
 from numba.core.codegen import get_host_cpu_features
 from numba.extending import lower_builtin, models, register_model, type_callable
+from numba.np.arrayobj import populate_array
 
 WIDTH = 16
 # XLA's numbers of pixel types. An image of ones is one bool.
@@ -20,27 +21,31 @@ BOOL, UINT8, UINT16 = 1, 6, 7
 # Sums may be reordered, but NaN stays NaN.
 FLAGS = ("reassoc", "nsz", "arcp", "contract", "afn")
 FAST = {"fastmath": set(FLAGS), "error_model": "numpy"}
+# Of functions that only kernels call.
+_WITHIN = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 I8, I32, I64, F32 = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
 FLOATS, INTEGERS = ir.VectorType(F32, WIDTH), ir.VectorType(I32, WIDTH)
 TWO, PAIRS = ir.VectorType(F32, 2), ir.VectorType(F32, 2 * WIDTH)
 _FEATURES = getattr(config, "CPU_FEATURES", None)
 # Whether one instruction permutes 32 numbers.
 HAS_AVX512 = "+avx512f" in (get_host_cpu_features() if _FEATURES is None else _FEATURES)
-carray: Any = _carray
 
 
 def inline(function):
     """Compile a function into its callers. Type checkers' wrappers are removed."""
-    return njit(inline="always", **FAST)(inspect.unwrap(function))
+    return njit(forceinline=True, **_WITHIN, **FAST)(inspect.unwrap(function))
 
 
 def function(function):
     """Compile a function once."""
-    return njit(**FAST)(inspect.unwrap(function))
+    return njit(**_WITHIN, **FAST)(inspect.unwrap(function))
 
 
 def instruction(result) -> Any:
-    """Make `emit(builder, *values)`, which writes LLVM code, callable in kernels. Integer arguments arrive as int64."""
+    """Make `emit(builder, *values)`, which writes LLVM code, callable in kernels. Integer arguments arrive as int64.
+
+    Of an array (C-contiguous) it returns the address and the sizes.
+    """
 
     def decorate(emit):
         def define(_, *kinds):
@@ -48,6 +53,8 @@ def instruction(result) -> Any:
 
             def code(context, builder, signature, values):
                 value = emit(builder, *values)
+                if isinstance(result, types.Array):
+                    return _array(context, builder, result, *value)
                 return context.get_dummy_value() if result is types.none else value
 
             return result(*kinds), code
@@ -56,6 +63,16 @@ def instruction(result) -> Any:
         return extending.intrinsic(define)
 
     return decorate
+
+
+def _array(context, builder, kind, address, sizes):
+    array = context.make_array(kind)(context, builder)
+    strides = [I64(kind.dtype.bitwidth // 8)]
+    for size in reversed(sizes[1:]):
+        strides.insert(0, builder.mul(strides[0], size))
+    data = builder.inttoptr(address, array.data.type)
+    populate_array(array, data=data, shape=sizes, strides=strides, itemsize=strides[-1], meminfo=None)
+    return array._getvalue()
 
 
 class Vector(types.Type):
@@ -118,12 +135,34 @@ def _store(builder, value, address):
     builder.store(value, builder.inttoptr(address, value.type.as_pointer()), align=4)
 
 
-pointer = instruction(types.voidptr)(lambda builder, address: builder.inttoptr(address, I8.as_pointer()))
+def load_number(builder, address, place):
+    """The number of 64 bits at a place of a list."""
+    return _load(builder, _place(builder, address, place), I64)
+
+
+def _place(builder, address, place):
+    return builder.add(address, builder.mul(place, I64(8)))
+
+
+@instruction(types.int64)
+def call(builder, function, first, second, third):
+    """Call a C function by its address; one with fewer arguments ignores the rest."""
+    kind = ir.FunctionType(I64, [I64, I64, I64]).as_pointer()
+    return builder.call(builder.inttoptr(function, kind), [first, second, third])
+
+
 zeros = instruction(VECTOR)(lambda builder: _constant(0.0))
 load = instruction(VECTOR)(lambda builder, address: _load(builder, address, FLOATS))
+# So many numbers from an address on.
+floats = instruction(types.Array(types.float32, 1, "C"))(lambda builder, address, count: (address, [count]))
+integers = instruction(types.Array(types.int32, 1, "C"))(lambda builder, address, count: (address, [count]))
 load_one = instruction(types.float32)(lambda builder, address: _load(builder, address, F32))
 load_int = instruction(types.int32)(lambda builder, address: _load(builder, address, I32))
+load_long = instruction(types.int64)(lambda builder, address, place: load_number(builder, address, place))
 store = instruction(types.none)(lambda builder, address, vector: _store(builder, vector, address))
+store_long = instruction(types.none)(
+    lambda builder, address, place, number: _store(builder, number, _place(builder, address, place))
+)
 store_one = instruction(types.none)(lambda builder, address, number: _store(builder, number, address))
 # Two neighbours, as 64 bits.
 copy_two = instruction(types.none)(lambda builder, source, target: _store(builder, _load(builder, source, I64), target))

@@ -10,8 +10,8 @@ import numpy as np
 from ...optics.field_varying import RADII
 from . import rows, simd
 from .fftconv import plane_bytes, transform, transform_back
-from .gather import align, scratch
-from .rows import HALF, PARTS, ZERO
+from .gather import align
+from .rows import HALF, ZERO
 from .simd import WIDTH, inline
 
 # Bytes of sixteen numbers.
@@ -29,17 +29,18 @@ def _sum_entries(start, column, share, row, at, stride):
     return total
 
 
-def to_spectra(job_address, part, _):
+def to_spectra(job, part, _):
     """A sparse matrix to polar nodes `(angle, field)`, and their spectra; a part is some pairs of fields."""
-    job = rows.job_at(job_address)
-    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
-    turns, order, side = rows.address(job, 3), rows.integers(job, 4)[:, 0, 0], rows.size(job, 4, 0)
+    start, column, share = rows.integer_list(job, 0), rows.integer_list(job, 1), rows.float_list(job, 2)
+    turns, order, side = rows.address(job, 3), rows.integer_list(job, 4), rows.size(job, 4, 0)
     at_x, stride, at_result = rows.address(job, 5), 4 * rows.size(job, 5, 1), rows.address(job, 6)
     fields, plane = rows.size(job, 6, 1), plane_bytes(side)
-    strip = scratch(plane // 2 + WIDTH)
-    at = align(strip)
+    memory = rows.allocate(job, plane // 2)
+    if memory == 0:
+        return rows.FAILED
+    at = align(memory)
     pairs = (fields + 1) // 2
-    for pair in range(part * pairs // job[PARTS], (part + 1) * pairs // job[PARTS]):
+    for pair in range(part * pairs // rows.parts(job), (part + 1) * pairs // rows.parts(job)):
         # The last may have no second: it is its own.
         one, two = 2 * pair, min(2 * pair + 1, fields - 1)
         for lens in range(0, stride, _STEP):
@@ -58,19 +59,21 @@ def to_spectra(job_address, part, _):
                 simd.store(at_imaginary + one * stride, HALF * (b - d))
                 simd.store(at_real + two * stride, HALF * (b + d))
                 simd.store(at_imaginary + two * stride, HALF * (c - a))
-    return rows.keep_alive((strip,))
+    return rows.free(job, memory)
 
 
-def from_spectra(job_address, part, _):
+def from_spectra(job, part, _):
     """The adjoint of `to_spectra`, with the transposed matrix; a part is some lenses."""
-    job = rows.job_at(job_address)
-    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
-    turns, order, side = rows.address(job, 3), rows.integers(job, 4)[:, 0, 0], rows.size(job, 4, 0)
+    start, column, share = rows.integer_list(job, 0), rows.integer_list(job, 1), rows.float_list(job, 2)
+    turns, order, side = rows.address(job, 3), rows.integer_list(job, 4), rows.size(job, 4, 0)
     fields, stride, at_result = rows.size(job, 5, 1), 4 * rows.size(job, 5, 2), rows.address(job, 6)
     nodes, plane, blocks = rows.size(job, 6, 0), plane_bytes(side), stride // _STEP
-    strip, polar = scratch(plane // 2 + WIDTH), scratch((side * fields + 1) * WIDTH)
-    at, at_polar = align(strip), align(polar)
-    for block in range(part * blocks // job[PARTS], (part + 1) * blocks // job[PARTS]):
+    memory = rows.allocate(job, plane // 2 + side * fields * WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at = align(memory)
+    at_polar = at + 2 * plane
+    for block in range(part * blocks // rows.parts(job), (part + 1) * blocks // rows.parts(job)):
         lens = _STEP * block
         for one in range(0, fields, 2):
             two = min(one + 1, fields - 1)
@@ -94,7 +97,7 @@ def from_spectra(job_address, part, _):
                 simd.store(at_polar + _STEP * (angle * fields + two), simd.load(at + plane + _STEP * angle))
         for node in range(nodes):
             simd.store(at_result + node * stride + lens, _sum_entries(start, column, share, node, at_polar, _STEP))
-    return rows.keep_alive((strip, polar))
+    return rows.free(job, memory)
 
 
 @inline
@@ -156,13 +159,15 @@ def _list_nonzero(at, fields, listed):
     return mean, count
 
 
-def add_products(job_address, part, _):
+def add_products(job, part, _):
     """Add each harmonic's products with its table to a sum; a part is some harmonics."""
-    job = rows.job_at(job_address)
     harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
-    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(rows.integers(job, 1)[0, 0, 0])
-    listed = np.empty(columns + 1, np.int64)
-    for harmonic in range(part * harmonics // job[PARTS], (part + 1) * harmonics // job[PARTS]):
+    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(simd.load_int(rows.address(job, 1)))
+    memory = rows.allocate(job, columns)
+    if memory == 0:
+        return rows.FAILED
+    listed = simd.integers(memory, columns)
+    for harmonic in range(part * harmonics // rows.parts(job), (part + 1) * harmonics // rows.parts(job)):
         at_x = rows.address(job, 4) + 2 * harmonic * fields * stride
         for row in range(0, radii, ROWS):
             block = ((depth * harmonics + harmonic) * radii + row) // ROWS
@@ -176,25 +181,26 @@ def add_products(job_address, part, _):
                     values = _load_rows(rows.address(job, 3) + at, stride)
                     at_part = at_x + part_of * fields * stride + lens
                     for number in range(mean):
-                        x = simd.load(at_part + listed[number] * stride)
-                        values = _add_scaled(values, at_table + 4 * ROWS * listed[number], x)
+                        x = simd.load(at_part + np.int64(listed[number]) * stride)
+                        values = _add_scaled(values, at_table + 4 * ROWS * np.int64(listed[number]), x)
                     for number in range(mean, count):
-                        x = excess * simd.load(at_part + (listed[number] - fields) * stride)
-                        values = _add_scaled(values, at_table + 4 * ROWS * listed[number], x)
+                        x = excess * simd.load(at_part + (np.int64(listed[number]) - fields) * stride)
+                        values = _add_scaled(values, at_table + 4 * ROWS * np.int64(listed[number]), x)
                     _store_rows(rows.address(job, 5) + at, stride, values)
-    listed[0] = 0
-    return rows.DONE
+    return rows.free(job, memory)
 
 
-def products_back(job_address, part, _):
+def products_back(job, part, _):
     """The adjoint of `add_products`; a part is some harmonics."""
-    job = rows.job_at(job_address)
     harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
-    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(rows.integers(job, 1)[0, 0, 0])
-    listed, result = np.empty(columns + 1, np.int64), rows.floats(job, 4)
-    for harmonic in range(part * harmonics // job[PARTS], (part + 1) * harmonics // job[PARTS]):
+    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(simd.load_int(rows.address(job, 1)))
+    memory = rows.allocate(job, columns)
+    if memory == 0:
+        return rows.FAILED
+    listed = simd.integers(memory, columns)
+    for harmonic in range(part * harmonics // rows.parts(job), (part + 1) * harmonics // rows.parts(job)):
         at_x = rows.address(job, 4) + 2 * harmonic * fields * stride
-        result[2 * harmonic : 2 * harmonic + 2] = ZERO
+        rows.fill(at_x, fields * stride // 2, ZERO)
         for row in range(0, radii, ROWS):
             block = ((depth * harmonics + harmonic) * radii + row) // ROWS
             at_table = rows.address(job, 0) + 4 * ROWS * block * columns
@@ -207,12 +213,11 @@ def products_back(job_address, part, _):
                     at = rows.address(job, 3) + ((2 * harmonic + part_of) * radii + row) * stride + lens
                     values, at_part = _load_rows(at, stride), at_x + part_of * fields * stride + lens
                     for number in range(mean):
-                        at = at_part + listed[number] * stride
-                        x = _sum_scaled(values, at_table + 4 * ROWS * listed[number])
+                        at = at_part + np.int64(listed[number]) * stride
+                        x = _sum_scaled(values, at_table + 4 * ROWS * np.int64(listed[number]))
                         simd.store(at, simd.load(at) + x)
                     for number in range(mean, count):
-                        at = at_part + (listed[number] - fields) * stride
-                        x = _sum_scaled(values, at_table + 4 * ROWS * listed[number])
+                        at = at_part + (np.int64(listed[number]) - fields) * stride
+                        x = _sum_scaled(values, at_table + 4 * ROWS * np.int64(listed[number]))
                         simd.store(at, simd.load(at) + excess * x)
-    listed[0] = 0
-    return rows.DONE
+    return rows.free(job, memory)

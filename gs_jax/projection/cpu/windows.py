@@ -7,8 +7,8 @@ some that are beyond the image.
 import numpy as np
 
 from . import rows, simd
-from .gather import align, scratch
-from .rows import ONE, PARTS, ZERO
+from .gather import align
+from .rows import ONE, ZERO
 from .simd import WIDTH, inline
 
 # Bytes of sixteen numbers, and of a square of them.
@@ -22,17 +22,18 @@ def _within(row, column, side, tall, wide):
     return row >= 0 and column >= 0 and row + side + WIDTH < tall and column + side + WIDTH < wide
 
 
-def read_windows(job_address, part, _):
+def read_windows(job, part, _):
     """Image to windows `(row, column, lens)`, interpolated linearly; a part is a band of their rows."""
-    job = rows.job_at(job_address)
-    start, fraction = rows.integers(job, 0)[:, :, 0], rows.floats(job, 1)[:, :, 0]
+    start, fraction = rows.integer_rows(job, 0), rows.float_rows(job, 1)
     tall, wide = rows.size(job, 2, 0), rows.size(job, 2, 1)
     side, lenses = rows.size(job, 3, 0), rows.size(job, 3, 2)
-    tiles = scratch(2 * WIDTH * WIDTH)
-    at_rows = align(tiles)
+    memory = rows.allocate(job, 2 * WIDTH * WIDTH)
+    if memory == 0:
+        return rows.FAILED
+    at_rows = align(memory)
     at_columns = at_rows + _TILE
     for block in range(0, lenses, WIDTH):
-        for i in range(part * side // job[PARTS], (part + 1) * side // job[PARTS]):
+        for i in range(part * side // rows.parts(job), (part + 1) * side // rows.parts(job)):
             at_result = rows.address(job, 3) + 4 * (i * side * lenses + block)
             for j in range(0, side, WIDTH):
                 for n in range(WIDTH):
@@ -47,21 +48,22 @@ def read_windows(job_address, part, _):
                 simd.transpose(at_rows, at_columns)
                 for m in range(min(WIDTH, side - j)):
                     simd.store(at_result + 4 * (j + m) * lenses, simd.load(at_columns + _STEP * m))
-    return rows.keep_alive((tiles,))
+    return rows.free(job, memory)
 
 
-def add_windows(job_address, part, _):
+def add_windows(job, part, _):
     """The adjoint of `read_windows`; a part is a band of rows of the image."""
-    job = rows.job_at(job_address)
-    start, fraction = rows.integers(job, 0)[:, :, 0], rows.floats(job, 1)[:, :, 0]
+    start, fraction = rows.integer_rows(job, 0), rows.float_rows(job, 1)
     side, lenses = rows.size(job, 2, 0), rows.size(job, 2, 2)
     tall, wide = rows.size(job, 3, 0), rows.size(job, 3, 1)
-    top, bottom = part * tall // job[PARTS], (part + 1) * tall // job[PARTS]
-    rows.floats(job, 3)[top:bottom] = ZERO
+    top, bottom = part * tall // rows.parts(job), (part + 1) * tall // rows.parts(job)
+    rows.fill(rows.address(job, 3) + 4 * top * wide, (bottom - top) * wide, ZERO)
     # A row of each window, with zeros before and after it.
     length = rows.padded(side) + 3 * WIDTH
-    lines = scratch(WIDTH * (length + 2 * WIDTH))
-    at_columns = align(lines)
+    memory = rows.allocate(job, WIDTH * (length + 2 * WIDTH))
+    if memory == 0:
+        return rows.FAILED
+    at_columns = align(memory)
     at_rows = at_columns + _TILE
     at_lines = at_rows + _TILE + _STEP
     for block in range(0, lenses, WIDTH):
@@ -94,4 +96,4 @@ def add_windows(job_address, part, _):
                         simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * value)
                     if row + 1 < bottom:
                         simd.store(at_lower + j, simd.load(at_lower + j) + down * value)
-    return rows.keep_alive((lines,))
+    return rows.free(job, memory)
