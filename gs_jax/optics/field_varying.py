@@ -85,8 +85,12 @@ class PolarGrid(NamedTuple):
         return np.pi * np.diff(edges**2) / self.angles
 
 
-def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> PolarGrid:
+def make_polar_grid(
+    imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None, coarser: int = 1
+) -> PolarGrid:
     """Nodes of the stray light for a range of depths and an object's extent, mm; by default the sensor's.
+
+    `coarser` is a factor by which they are farther apart.
 
     Fields are from the axes of the lenses, which lean if the array is tilted.
     """
@@ -100,7 +104,7 @@ def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, ex
     middle = float(imager.magnification(float(depths.min() + depths.max()) / 2))
     linear = _LINEAR * _WIDEST * near
     # A whole number of pixels.
-    pixels = max(round(middle * linear / _NODES / imager.sensor.pixel_pitch), 1)
+    pixels = max(round(coarser * middle * linear / _NODES / imager.sensor.pixel_pitch), 1)
     pixel = pixels * imager.sensor.pixel_pitch
     step = pixel / middle
     bend = linear / step

@@ -75,6 +75,7 @@ def psf_model(
     fidelity: str = "full",
     *,
     psf: str = "geometric",
+    coarser: int = 1,
     progress: Progress | None = None,
 ) -> PsfModel:
     """The PSF model of a microscope for a grid, for `forward` and the solvers.
@@ -91,6 +92,8 @@ def psf_model(
         exact rays.
     psf
         Of a lens, for `"near"`: `"diffraction"`, `"geometric"` (rays alone) or `"gaussian"`.
+    coarser
+        Factor by which the nodes of the stray light are farther apart, for wide voxels.
     progress
         Shows how many depths are done.
 
@@ -127,7 +130,7 @@ def psf_model(
     elif fidelity == "full":
         # The sensor is as wide as most objects, whose tables then have the same nodes.
         extent = max(2 * max(map(abs, imager.sensor.extent)), extent_of(grid))
-        nodes = make_polar_grid(imager, depths, extent=extent)
+        nodes = make_polar_grid(imager, depths, extent=extent, coarser=coarser)
         parts = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in imagers]
     else:
         areas = relative_areas(imagers).tolist() if len(imagers) > 1 else [1.0]

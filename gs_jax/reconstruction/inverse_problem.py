@@ -1,5 +1,6 @@
 """The inverse problem of iterative methods: light to explain, in pixels as wide as voxels, its noise, the operator."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from ..optics.field_varying import FieldVaryingPsf
 from ..optics.psf_core import core_distortion, type_weights
 from ..projection.forward_model import Optics, PsfModel, check_optics, psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
+from ..solvers.base import Refinement
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARK_PERCENTILE = 1
@@ -33,6 +35,8 @@ _HALF_WAVE = 6.5
 _ROUNDING = 0.02
 # Largest distance of voxels on the sensor, in binned pixels. Voxels are points: farther apart, their images leave gaps.
 _FARTHEST = 1.5
+# Factors by which voxels are wider in the first steps, and voxels along a side that must be left.
+_FACTORS, _LEAST_VOXELS = (4, 2), 48
 
 
 def prepare_data(image: Image, problem: "InverseProblem") -> tuple[Any, Any]:
@@ -269,3 +273,30 @@ def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Pr
     model = psf_model(imager, grid, optics, progress=progress)
     options = {"binning": binning, "is_partial": optics != "full"}
     return InverseProblem(imager, grid, model, detrend_modes=num_detrend_modes(imager, model), **options)
+
+
+def wider_problems(problem: InverseProblem, imager: Imager, optics: str, progress: Progress) -> list[InverseProblem]:
+    """The same problem with voxels and pixels four times, and twice, as wide, where enough are left to gain from.
+
+    `imager` has the camera's pixels.
+    """
+    return [
+        _wider_problem(problem, imager, optics, factor, progress)
+        for factor in _FACTORS
+        if min(problem.grid.shape) >= _LEAST_VOXELS * factor
+    ]
+
+
+def _wider_problem(problem, imager, optics, factor, progress) -> InverseProblem:
+    grid, binning = problem.grid, factor * problem.binning
+    shape = [2 * round((n / factor - 1) / 2) + 1 for n in grid.shape]
+    grid = Grid(grid.depths, shape, factor * grid.pitch, grid.origin)
+    imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
+    model = psf_model(imager, grid, optics, coarser=factor, progress=progress)
+    return dataclasses.replace(problem, imager=imager, grid=grid, optics=model, binning=binning)
+
+
+def refinement(wide: InverseProblem, narrow: InverseProblem) -> Refinement:
+    """From the voxels of one problem to those of another, which are narrower."""
+    factor = wide.binning // narrow.binning
+    return Refinement.of(narrow.grid.shape, wide.grid.shape, factor, np.dtype(narrow.imager.sensor_distance.dtype))

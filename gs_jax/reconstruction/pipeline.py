@@ -21,7 +21,16 @@ from ..optics.psf_core import warn_if_blurred
 from ..projection.backprojection import backproject, backproject_on_all_devices
 from ..projection.forward_model import FIDELITIES, Optics, check_optics
 from ..solvers.admm import ADMM
-from ..solvers.base import Operator, Solver, check_solver, estimate_of, run_solver, start_solver, take_step
+from ..solvers.base import (
+    Operator,
+    Solver,
+    check_solver,
+    estimate_of,
+    refine_state,
+    run_solver,
+    start_solver,
+    take_step,
+)
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState
 from ..solvers.surface import Surface
@@ -33,6 +42,9 @@ from .inverse_problem import (
     lens_type_geometries,
     prepare_data,
     prepare_model,
+    refinement,
+    sum_pixels,
+    wider_problems,
 )
 
 # Planes that each device back-projects between two updates of the progress bar.
@@ -277,6 +289,7 @@ class Reconstructor(eqx.Module):
     problem: InverseProblem
     image_shape: tuple[int, int] = eqx.field(static=True)
     stop_at_discrepancy: bool = eqx.field(static=True)
+    wider: tuple[InverseProblem, ...] = ()
 
     def __init__(
         self,
@@ -310,9 +323,18 @@ class Reconstructor(eqx.Module):
             warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
         modes = 0 if isinstance(method, RichardsonLucy | Surface) else problem.detrend_modes
         self.problem = dataclasses.replace(problem, back_projections=views, detrend_modes=modes)
+        if isinstance(optics, str) and hasattr(method, "stages"):
+            self.wider = tuple(wider_problems(self.problem, imager, optics, progress or Progress()))
 
     def init(self, image: Image, start: Any = None) -> State:
         """State before the first step; or that of the solver, if given, which `run` overwrites."""
+        state = self._state_of_image(image)._replace(solver=start)
+        if start is not None or isinstance(self.method, BackProjection):
+            return state
+        return state._replace(solver=start_solver(self._solver(state), state.light, self.problem))
+
+    def _state_of_image(self, image: Image) -> State:
+        """State without that of the solver."""
         _check_image(image, self.image_shape)
         if isinstance(self.method, BackProjection):
             check_finite("image", image)
@@ -331,10 +353,7 @@ class Reconstructor(eqx.Module):
                 light = self.problem.detrend(light)
         if (kept := self.problem.kept) is not None:
             light, target = kept * light, target * kept.mean()
-        state = State(jnp.asarray(light), background, target, start)
-        if start is not None:
-            return state
-        return state._replace(solver=start_solver(self._solver(state), state.light, self.problem))
+        return State(jnp.asarray(light), background, target)
 
     def step(self, state: State) -> State:
         """Take one step; back-projection has none."""
@@ -357,13 +376,40 @@ class Reconstructor(eqx.Module):
         run = run_solver(self._solver(state), state.light, self.problem, progress, **options)
         return state._replace(solver=run.state, cost=run.cost, residual=run.residual)
 
+    def solve(self, image: Image, progress: Progress) -> State:
+        """State after all steps from nothing: on wide voxels, if the grid has enough, and then some on its own.
+
+        Depth, which many steps take to find, is found where they are fast.
+        """
+        method: Any = self.method
+        stages = method.stages(len(self.wider)) if self.wider else []
+        if not stages:
+            return self.run(self.init(image), progress)
+        last: Any = None
+        state: Any = None
+        for problem, solver in zip((*self.wider, self.problem), stages, strict=True):
+            level = eqx.tree_at(lambda r: (r.problem, r.method, r.wider), self, (problem, solver, ()))
+            start = level._state_of_image(image)
+            shared = level._solver(start), start.light, problem
+            begun = refine_state(state.solver, *shared, refinement(last, problem)) if state else start_solver(*shared)
+            last, state = problem, level.run(start._replace(solver=begun), progress)
+        return state
+
     def __call__(self, image: Image, progress: Progress | None = None) -> Volume:
         progress = progress or Progress()
-        return np.asarray(self.finish(self.run(self.init(image), progress), progress), np.float32)
+        return np.asarray(self.finish(self.solve(image, progress), progress), np.float32)
 
     def keeping(self, kept: Float[Array | np.ndarray, "row column"]) -> "Reconstructor":
-        """The same for some pixels of the model: 1 for those that are explained, and 0 for those that are left out."""
-        return eqx.tree_at(lambda r: r.problem.kept, self, kept, is_leaf=lambda leaf: leaf is None)
+        """The same for some pixels of the model: 1 for those that are explained, and 0 for those that are left out.
+
+        Wide pixels are explained where all of theirs are.
+        """
+        masks = [kept]
+        for problem in self.wider:
+            side = problem.binning // self.problem.binning
+            masks.append((sum_pixels(kept, side) == side**2).astype(kept.dtype))
+        where = lambda r: tuple(problem.kept for problem in (r.problem, *r.wider))
+        return eqx.tree_at(where, self, tuple(masks), is_leaf=lambda leaf: leaf is None)
 
     def by(self, method: Method) -> "Reconstructor":
         """The same by a method of the same class, with other options."""

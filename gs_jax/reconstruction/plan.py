@@ -217,8 +217,11 @@ def follow_volume(
     # No step lights a volume that is dark.
     follows = last is not None and abs(light - last.light) < _COLD_CHANGE * last.light and bool(last.solver.x.any())
     target = _TARGET_RATIO * last.unexplained * light if last and follows else 0.0
-    state = reconstructor.init(image, _restart(last.solver) if last and follows else None)
-    state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
+    if last and follows:
+        state = reconstructor.init(image, _restart(last.solver))
+        state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
+    else:
+        state = reconstructor.solve(image, progress)
     # The divergence of counts is proportional to their sum.
     unexplained = last.unexplained if last else 0.0
     if state.cost >= target:

@@ -21,6 +21,8 @@ from ..base.arrays import check_real, divide, native, safe_sqrt
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 
+# Steps on voxels four times and twice as wide, and on a solver's own, of those that it has.
+_SHARES, _LAST_SHARE = (1.5, 0.4), 0.1
 # Weights with a standard deviation of one voxel.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
@@ -92,6 +94,51 @@ class Solver(Protocol):
     def estimate(self, state: Any) -> Array:
         """Volume of a state."""
         ...
+
+
+class Refinement(eqx.Module):
+    """Linear interpolation from wide voxels to narrow ones, for solvers that go on from a state on wide voxels.
+
+    Such a solver has two more methods. `stages(count)` are the solvers for so many grids of wider voxels, from the
+    widest on, and for its own grid; `refined(A, image, state, refinement)` is the state on narrower voxels.
+
+    Parameters
+    ----------
+    rows, columns
+        Weights of the wide voxels in each narrow one, along each axis.
+    factor
+        Width of a wide voxel in narrow ones. Pixels are wider by the same factor.
+    """
+
+    rows: Float[Array | np.ndarray, "row wide_row"]
+    columns: Float[Array | np.ndarray, "column wide_column"]
+    factor: Float[Array | np.ndarray, ""]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], wide: tuple[int, int], factor: int, dtype: Any) -> "Refinement":
+        """Between planes with the same middle; beyond the outer wide voxels values are those of these."""
+
+        def weights(count, wide_count):
+            place = (np.arange(count) - (count - 1) / 2) / factor + (wide_count - 1) / 2
+            place = np.clip(place, 0, wide_count - 1)[:, None]
+            return np.maximum(1 - np.abs(place - np.arange(wide_count)), 0).astype(dtype)
+
+        return cls(*map(weights, shape, wide), np.asarray(factor, dtype))
+
+    def values(self, volume: Float[Array, "depth wide_row wide_column"]) -> Float[Array, "depth row column"]:
+        """Values of a volume at the narrow voxels."""
+        return jnp.einsum("ya,dab,xb->dyx", self.rows, volume, self.columns)
+
+    def light(self, volume: Float[Array, "depth wide_row wide_column"]) -> Float[Array, "depth row column"]:
+        """A volume's light, shared by the narrow voxels."""
+        return self.values(volume) / self.factor**2
+
+
+def stages(solver: Any, count: int, last: Any = None) -> list[Any]:
+    """Stages of a solver on so many grids of wider voxels and on its own, by default a few of its steps."""
+    few = dataclasses.replace(solver, steps=math.ceil(_LAST_SHARE * solver.steps))
+    wide = [dataclasses.replace(solver, steps=math.ceil(share * solver.steps)) for share in _SHARES[:count]]
+    return [*wide, few if last is None else last]
 
 
 class RESULTS(eqx.Enumeration):
@@ -273,6 +320,11 @@ def start_solver(solver: Any, light: Any, A: Any) -> Any:
     return _init(_for_one_step(solver), light, A)
 
 
+def refine_state(state: Any, solver: Any, light: Any, A: Any, refinement: Refinement) -> Any:
+    """`solver.refined`, by one compiled program."""
+    return _refine(state, _for_one_step(solver), light, A, refinement)
+
+
 def take_step(state: Any, solver: Any, light: Any, A: Any) -> tuple[Any, Any, Any]:
     """`solver.step`, by one compiled program."""
     return _step(state, _for_one_step(solver), light, A)
@@ -296,6 +348,11 @@ def _estimate(solver, state):
 @jax.jit
 def _init(solver, light, A):
     return _strong(solver.init(A, light))
+
+
+@jax.jit
+def _refine(state, solver, light, A, refinement):
+    return _strong(solver.refined(A, light, state, refinement))
 
 
 def _take_step(state, solver, light, A):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide
 from ..base.typing import Real
-from .base import Operator, as_image, check_options, lambda_max, norm
+from .base import Operator, Refinement, as_image, check_options, lambda_max, norm, stages
 
 # Steps of Lanczos' method find the largest eigenvalue to about a percent; the margin covers the rest.
 _LANCZOS_STEPS, _MARGIN = 6, 1.05
@@ -92,6 +92,15 @@ class FISTA(eqx.Module):
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
+
+    def stages(self, count: int) -> "list[FISTA]":
+        return stages(self, count)
+
+    def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
+        """The state on narrower voxels; the eigenvalue, whose vector is smooth, is that on wide ones."""
+        weight = jnp.asarray(self.sparsity, image.dtype) * lambda_max(A.T.mv(image))
+        x, point = refinement.light(state.x), refinement.light(state.point)
+        return State(x, point, state.t, state.rate, weight)
 
 
 def largest_eigenvalue(A: Operator) -> Float[Array, ""]:

@@ -4,6 +4,7 @@ Richardson, J. Opt. Soc. Am. 62, 55 (1972); Lucy, Astron. J. 79, 745 (1974). Eac
 back-projected ratio of the measured to the expected image, which increases the likelihood of Poisson counts.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from ..base.errors import InputError
 from ..base.typing import Real
 from .base import (
     Operator,
+    Refinement,
     as_image,
     blurred,
     check_options,
@@ -26,12 +28,15 @@ from .base import (
     magnitude,
     none_if_zero,
     norm,
+    stages,
 )
 
 # Default number of background knots along each side: their spacing is wider than the stray light of a spot.
 BACKGROUND_KNOTS = 8
 # Lower bound of Dey's denominator, which must stay positive.
 _MIN_DENOMINATOR = 0.1
+# Relative change of a step on narrow voxels, after many on wide ones, below which no more are taken.
+_SETTLED = 0.05
 # Rounding errors of an FFT, in units of the type's precision times the largest sensitivity.
 _ROUNDING = 100
 # Uniform share of the volume from which the next image of a recording starts.
@@ -115,10 +120,7 @@ class RichardsonLucy(eqx.Module):
         image = jnp.maximum(as_image(A, image), 0)
         if self.background_knots and image.ndim != 2:
             raise InputError(f"image must be 2-D to fit a background with background_knots, got {image.ndim}-D.")
-        sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
-        if self.min_sensitivity is not None:
-            minimum = jnp.asarray(self.min_sensitivity, sensitivity.dtype) * jnp.mean(sensitivity)
-            sensitivity = jnp.where(sensitivity > 0, jnp.maximum(sensitivity, minimum), 0)
+        sensitivity = self._sensitivity(A, image)
         # The start has as much light as the image; its scale matters only with a background.
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
         x = jnp.where(sensitivity > 0, level, 0)
@@ -140,6 +142,23 @@ class RichardsonLucy(eqx.Module):
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
+
+    def stages(self, count: int) -> "list[RichardsonLucy]":
+        return stages(self, count, dataclasses.replace(self, tolerance=max(self.tolerance, _SETTLED)))
+
+    def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
+        """The state on narrower voxels; it goes on with the same momentum."""
+        momentum = state.momentum and (*map(refinement.light, state.momentum[:2]), state.momentum[2])
+        knots = None if state.knots is None else state.knots / refinement.factor**2
+        return State(refinement.light(state.x), self._sensitivity(A, image), momentum, knots)
+
+    def _sensitivity(self, A, image):
+        """`A'1`, with its lower bound."""
+        sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
+        if self.min_sensitivity is None:
+            return sensitivity
+        minimum = jnp.asarray(self.min_sensitivity, sensitivity.dtype) * jnp.mean(sensitivity)
+        return jnp.where(sensitivity > 0, jnp.maximum(sensitivity, minimum), 0)
 
 
 def restarted(state: State) -> State:

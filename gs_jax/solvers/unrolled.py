@@ -6,8 +6,9 @@ Richardson-Lucy factor is raised to a trained power, and a network weighs each v
 steps are conjugate gradients of least squares, weighted by the brightness found so far.
 """
 
+import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,7 +20,18 @@ from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 from ..base.arrays import divide
 from ..base.errors import InputError
 from ..base.weights import shipped_weights
-from .base import Operator, as_image, blurred, check_options, kept_pixels, norm, project, project_back
+from .base import (
+    Operator,
+    Refinement,
+    as_image,
+    blurred,
+    check_options,
+    kept_pixels,
+    norm,
+    project,
+    project_back,
+    stages,
+)
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
@@ -229,6 +241,19 @@ class Unrolled(eqx.Module):
         gradients = state.gradients
         is_last = state.number > self.first + self.power.size
         return jnp.where(is_last, jnp.maximum(gradients.variance * gradients.weights, 0), state.lucy.x)
+
+    def stages(self, count: int) -> list[Any]:
+        """Steps of kind 1 on wide voxels, and the others; none if there are no others."""
+        if not 0 < self.first < self.steps:
+            return []
+        last = dataclasses.replace(self, steps=self.steps - self.first)
+        return stages(dataclasses.replace(_LUCY, steps=self.first), count, last)
+
+    def refined(self, A: Operator, image: Float[Array, "..."], state: LucyState, refinement: Refinement) -> State:
+        """The state before the first step with a network."""
+        start = self.init(A, image)
+        lucy = _LUCY.refined(A, image, state, refinement)._replace(sensitivity=start.lucy.sensitivity)
+        return start._replace(lucy=lucy, number=jnp.full_like(start.number, self.first))
 
     @staticmethod
     def pretrained() -> "Unrolled":
