@@ -32,7 +32,7 @@ from ..solvers.base import (
     take_step,
 )
 from ..solvers.fista import FISTA
-from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState
+from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState, sharpened
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from .inverse_problem import (
@@ -199,7 +199,8 @@ def reconstruct(
 
     Back-projection uses the image as it is, some planes at a time, on all devices. The other methods subtract the
     camera's offset, the image's first percentile (unless it is negative, because it was subtracted before). They run
-    step by step and can be interrupted after each; a second call with the same shapes compiles nothing.
+    step by step and can be interrupted after each; a second call with the same shapes compiles nothing. Solvers that
+    can (`gs_jax.solvers.base.Refinement`) begin with wider voxels and pixels, if the grid has 96 voxels a side.
 
     With optics by name, iterative methods bin pixels to about the width of voxels, and light that the optics lack is
     fitted as background, not by voxels. With "full" that is smooth: FISTA and ADMM leave out the image's lowest cosine
@@ -290,6 +291,7 @@ class Reconstructor(eqx.Module):
     image_shape: tuple[int, int] = eqx.field(static=True)
     stop_at_discrepancy: bool = eqx.field(static=True)
     wider: tuple[InverseProblem, ...] = ()
+    views: tuple[LensTypeGeometry, ...] | None = None
 
     def __init__(
         self,
@@ -312,8 +314,7 @@ class Reconstructor(eqx.Module):
         self.method, self.image_shape, self.stop_at_discrepancy = method, imager.sensor.shape, stop_at_discrepancy
         views = None
         if isinstance(method, BackProjection | PinholeRichardsonLucy | Unrolled):
-            on_cores = by_name and optics != "pinhole"
-            views = lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager),)
+            views = _views(imager, grid, optics)
         if isinstance(method, BackProjection):
             self.problem = InverseProblem(imager, grid, None, views)
             return
@@ -325,6 +326,8 @@ class Reconstructor(eqx.Module):
         self.problem = dataclasses.replace(problem, back_projections=views, detrend_modes=modes)
         if isinstance(optics, str) and hasattr(method, "stages"):
             self.wider = tuple(wider_problems(self.problem, imager, optics, progress or Progress()))
+        if self.wider and isinstance(method, RichardsonLucy):
+            self.views = views or _views(imager, grid, optics)
 
     def init(self, image: Image, start: Any = None) -> State:
         """State before the first step; or that of the solver, if given, which `run` overwrites."""
@@ -392,6 +395,8 @@ class Reconstructor(eqx.Module):
             start = level._state_of_image(image)
             shared = level._solver(start), start.light, problem
             begun = refine_state(state.solver, *shared, refinement(last, problem)) if state else start_solver(*shared)
+            if problem is self.problem and isinstance(solver, RichardsonLucy):
+                begun = sharpened(begun, dataclasses.replace(problem, back_projections=self.views), start.light)
             last, state = problem, level.run(start._replace(solver=begun), progress)
         return state
 
@@ -442,6 +447,12 @@ class Reconstructor(eqx.Module):
         kept = xp.repeat(xp.repeat(kept, side, 0), side, 1)
         kept = xp.pad(kept, [(0, n - m) for n, m in zip(image.shape, kept.shape, strict=True)], mode="edge")
         return _quotient(total(kept * image, method.normalize), total(kept, True))
+
+
+def _views(imager, grid, optics) -> tuple[LensTypeGeometry, ...]:
+    """Geometries for back-projection: along the cores of spots with optics by name that have them, or chief rays."""
+    on_cores = isinstance(optics, str) and optics != "pinhole"
+    return lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager),)
 
 
 def check_call(image: Image, imager: Imager, method: Method, optics: Optics | str) -> None:

@@ -36,6 +36,7 @@ from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
     State as LucyState,
+    agreement,
     background_step,
     bilinear_background,
     extrapolate,
@@ -50,8 +51,10 @@ _CHANNELS = 7
 # Kernel sizes of the layers, and a network's lateral reach.
 _SIDES = (3, 3, 1)
 _MARGIN = sum(side // 2 for side in _SIDES)
-# Light that counts as dark, relative to the mean pixel: in the agreement of lenses, and in ratios.
-_DARK, _FAINT = 1e-2, 1e-3
+# Light that counts as dark in ratios, relative to the mean pixel.
+_FAINT = 1e-3
+# Steps of kind 1 that are taken on narrow voxels after those on wide ones.
+_NARROW = 5
 _MAX_FACTOR = 20.0
 # Rows of voxels that a network processes at once, which bounds the memory.
 _ROWS = 128
@@ -147,13 +150,9 @@ class Unrolled(eqx.Module):
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
         lucy = _LUCY.init(A, image)
-        dark = _DARK * jnp.mean(image)
-        inverse = divide(jnp.ones_like(image), image + dark)
-        # Harmonic mean of the pixels under a voxel's lenses: bright where all of them are.
-        agreement = jnp.maximum(divide(lucy.sensitivity, A.T.mv(inverse)) - dark, 0)
         zeros, zero = jnp.zeros_like(lucy.x), jnp.zeros((), lucy.x.dtype)
         gradients = ConjugateGradients(zeros, zeros, zeros, zeros, zero, zero, zero)
-        return State(lucy, agreement, gradients, jnp.zeros((), jnp.int32))
+        return State(lucy, agreement(A, image, lucy.sensitivity), gradients, jnp.zeros((), jnp.int32))
 
     def step(
         self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
@@ -243,17 +242,17 @@ class Unrolled(eqx.Module):
         return jnp.where(is_last, jnp.maximum(gradients.variance * gradients.weights, 0), state.lucy.x)
 
     def stages(self, count: int) -> list[Any]:
-        """Steps of kind 1 on wide voxels, and the others; none if there are no others."""
-        if not 0 < self.first < self.steps:
+        """Steps of kind 1 on wide voxels, and a few of them with the others; none if there are no others."""
+        if not _NARROW < self.first < self.steps:
             return []
-        last = dataclasses.replace(self, steps=self.steps - self.first)
+        last = dataclasses.replace(self, steps=self.steps - self.first + _NARROW)
         return stages(dataclasses.replace(_LUCY, steps=self.first), count, last)
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: LucyState, refinement: Refinement) -> State:
-        """The state before the first step with a network."""
+        """The state before the last steps of kind 1."""
         start = self.init(A, image)
         lucy = _LUCY.refined(A, image, state, refinement)._replace(sensitivity=start.lucy.sensitivity)
-        return start._replace(lucy=lucy, number=jnp.full_like(start.number, self.first))
+        return start._replace(lucy=lucy, number=jnp.full_like(start.number, self.first - _NARROW))
 
     @staticmethod
     def pretrained() -> "Unrolled":
