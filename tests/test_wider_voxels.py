@@ -42,7 +42,7 @@ def bright_square(monkeypatch):
     "name",
     [
         "richardson-lucy",
-        *(pytest.param(name, marks=pytest.mark.integration) for name in ("list-rl", "fista", "admm", "unrolled")),
+        *(pytest.param(name, marks=pytest.mark.integration) for name in ("list-rl", "fista", "unrolled")),
     ],
 )
 def test_it_goes_on_from_wide_voxels(bright_square, name):

@@ -32,14 +32,12 @@ from ..base.typing import Image, Real
 from ..linear.measured_psf import ConvolutionOperator
 from .base import (
     Operator,
-    Refinement,
     as_image,
     check_options,
     differences,
     differences_adjoint,
     lambda_max,
     shrink,
-    stages,
     total_variation,
 )
 
@@ -223,16 +221,6 @@ class ADMM(eqx.Module):
     def smoother(self, state: State, factor: float) -> State:
         """The state to continue from with `factor` times the weight of total variation."""
         return state._replace(weights=state.weights._replace(tv=factor * state.weights.tv))
-
-    def stages(self, count: int) -> "list[ADMM]":
-        return stages(self, count)
-
-    def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
-        """The state on narrower voxels, with the same penalty."""
-        x, back = refinement.light(state.iterate.x), A.T.mv(image)
-        shown = A.mv(x)
-        sums = differences(x), refinement.light(state.sums[1])
-        return State(Iterate(x, shown, A.T.mv(shown)), sums, state.penalty, _weights(self, back), back)
 
     def _prox(self, weights, rho):
         return _proximal_maps(weights, rho, isotropic=self.isotropic, nonnegative=True)

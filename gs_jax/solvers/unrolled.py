@@ -34,6 +34,7 @@ from .base import (
 )
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
+    WIDE_STEPS,
     RichardsonLucy,
     State as LucyState,
     agreement,
@@ -246,7 +247,7 @@ class Unrolled(eqx.Module):
         if not _NARROW < self.first < self.steps:
             return []
         last = dataclasses.replace(self, steps=self.steps - self.first + _NARROW)
-        return stages(dataclasses.replace(_LUCY, steps=self.first), count, last)
+        return stages(dataclasses.replace(_LUCY, steps=self.first), count, last, more=WIDE_STEPS)
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: LucyState, refinement: Refinement) -> State:
         """The state before the last steps of kind 1."""
