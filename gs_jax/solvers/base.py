@@ -22,7 +22,7 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 
 # Steps on voxels four times and twice as wide, and on a solver's own, of those that it has.
-_SHARES, _LAST_SHARE = (1.0, 0.25), 0.1
+_SHARES, _LAST_SHARE = (1.5, 0.4), 0.1
 # Weights with a standard deviation of one voxel.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
@@ -134,16 +134,13 @@ class Refinement(eqx.Module):
         return self.values(volume) / self.factor**2
 
 
-def stages(solver: Any, count: int, last: Any = None, *, more: float = 1.0) -> list[Any]:
-    """Stages of a solver on so many grids of wider voxels and on its own, by default a few of its steps.
-
-    `more` is a factor of the steps on wider voxels.
-    """
+def stages(solver: Any, count: int, last: Any = None) -> list[Any]:
+    """Stages of a solver on so many grids of wider voxels and on its own, by default a few of its steps."""
 
     def taking(share):
         return dataclasses.replace(solver, steps=math.ceil(share * solver.steps))
 
-    return [*(taking(more * share) for share in _SHARES[:count]), taking(_LAST_SHARE) if last is None else last]
+    return [*(taking(share) for share in _SHARES[:count]), taking(_LAST_SHARE) if last is None else last]
 
 
 class RESULTS(eqx.Enumeration):

@@ -36,8 +36,6 @@ from .base import (
 BACKGROUND_KNOTS = 8
 # Lower bound of Dey's denominator, which must stay positive.
 _MIN_DENOMINATOR = 0.1
-# Steps on wider voxels, relative to those of other solvers: they are cheap.
-WIDE_STEPS = 1.5
 # Relative change of a step on narrow voxels, after many on wide ones, below which no more are taken.
 _SETTLED = 0.04
 # Light that counts as dark in the agreement of lenses, relative to the mean pixel.
@@ -149,7 +147,7 @@ class RichardsonLucy(eqx.Module):
         return state.x
 
     def stages(self, count: int) -> "list[RichardsonLucy]":
-        return stages(self, count, dataclasses.replace(self, tolerance=max(self.tolerance, _SETTLED)), more=WIDE_STEPS)
+        return stages(self, count, dataclasses.replace(self, tolerance=max(self.tolerance, _SETTLED)))
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""

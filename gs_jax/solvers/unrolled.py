@@ -34,7 +34,6 @@ from .base import (
 )
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
-    WIDE_STEPS,
     RichardsonLucy,
     State as LucyState,
     agreement,
@@ -247,7 +246,7 @@ class Unrolled(eqx.Module):
         if not _NARROW < self.first < self.steps:
             return []
         last = dataclasses.replace(self, steps=self.steps - self.first + _NARROW)
-        return stages(dataclasses.replace(_LUCY, steps=self.first), count, last, more=WIDE_STEPS)
+        return stages(dataclasses.replace(_LUCY, steps=self.first), count, last)
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: LucyState, refinement: Refinement) -> State:
         """The state before the last steps of kind 1."""
