@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -103,6 +103,8 @@ class PinholeRichardsonLucy(RichardsonLucy):
     >>> print(volume.argmax() == np.ravel_multi_index((1, 19, 22), volume.shape))
     True
     """
+
+    settled: ClassVar[float] = 0.04
 
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> LucyState:
         if not getattr(A, "back_projections", None):
@@ -380,10 +382,7 @@ class Reconstructor(eqx.Module):
         return state._replace(solver=run.state, cost=run.cost, residual=run.residual)
 
     def solve(self, image: Image, progress: Progress) -> State:
-        """State after all steps from nothing: on wide voxels, if the grid has enough, and then some on its own.
-
-        Depth, which many steps take to find, is found where they are fast.
-        """
+        """State after all steps from nothing: on wide voxels, which find depth fast, if the grid has enough, and its own."""
         method: Any = self.method
         stages = method.stages(len(self.wider)) if self.wider else []
         if not stages:

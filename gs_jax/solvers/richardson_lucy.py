@@ -5,7 +5,7 @@ back-projected ratio of the measured to the expected image, which increases the 
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,8 +36,6 @@ from .base import (
 BACKGROUND_KNOTS = 8
 # Lower bound of Dey's denominator, which must stay positive.
 _MIN_DENOMINATOR = 0.1
-# Relative change of a step on narrow voxels, after many on wide ones, below which no more are taken.
-_SETTLED = 0.04
 # Light that counts as dark in the agreement of lenses, relative to the mean pixel.
 _DARK = 1e-2
 # Rounding errors of an FFT, in units of the type's precision times the largest sensitivity.
@@ -113,6 +111,8 @@ class RichardsonLucy(eqx.Module):
     tv: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
     background_knots: int = eqx.field(static=True, default=0)
     min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
+    # Relative change of a step on narrow voxels, after many on wide ones, below which no more are taken.
+    settled: ClassVar[float] = 0.015
 
     def __check_init__(self):
         check_options(self)
@@ -147,7 +147,7 @@ class RichardsonLucy(eqx.Module):
         return state.x
 
     def stages(self, count: int) -> "list[RichardsonLucy]":
-        return stages(self, count, dataclasses.replace(self, tolerance=max(self.tolerance, _SETTLED)))
+        return stages(self, count, dataclasses.replace(self, tolerance=max(self.tolerance, self.settled)))
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""
