@@ -382,7 +382,7 @@ class Reconstructor(eqx.Module):
         return state._replace(solver=run.state, cost=run.cost, residual=run.residual)
 
     def solve(self, image: Image, progress: Progress) -> State:
-        """State after all steps from nothing: on wide voxels, which find depth fast, if the grid has enough, and its own."""
+        """State after all steps, on wide voxels, which find depth fast, if the grid has enough, and on its own."""
         method: Any = self.method
         stages = method.stages(len(self.wider)) if self.wider else []
         if not stages:
