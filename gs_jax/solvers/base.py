@@ -123,13 +123,18 @@ class Refinement(eqx.Module):
             place = np.clip(place, 0, wide_count - 1)[:, None]
             return np.maximum(1 - np.abs(place - np.arange(wide_count)), 0).astype(dtype)
 
-        return cls(*map(weights, shape, wide), np.asarray(factor, dtype))
+        rows, columns = map(weights, shape, wide)
+        return cls(rows, columns, np.asarray(factor, dtype))
 
-    def values(self, volume: Float[Array, "depth wide_row wide_column"]) -> Float[Array, "depth row column"]:
+    def values(
+        self, volume: Float[Array | np.ndarray, "depth wide_row wide_column"]
+    ) -> Float[Array, "depth row column"]:
         """Values of a volume at the narrow voxels."""
         return jnp.einsum("ya,dab,xb->dyx", self.rows, volume, self.columns)
 
-    def light(self, volume: Float[Array, "depth wide_row wide_column"]) -> Float[Array, "depth row column"]:
+    def light(
+        self, volume: Float[Array | np.ndarray, "depth wide_row wide_column"]
+    ) -> Float[Array, "depth row column"]:
         """A volume's light, shared by the narrow voxels."""
         return self.values(volume) / self.factor**2
 

@@ -151,7 +151,9 @@ class RichardsonLucy(eqx.Module):
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""
-        momentum = state.momentum and (*map(refinement.light, state.momentum[:2]), state.momentum[2])
+        momentum = state.momentum
+        if momentum:
+            momentum = refinement.light(momentum[0]), refinement.light(momentum[1]), momentum[2]
         knots = None if state.knots is None else state.knots / refinement.factor**2
         return State(refinement.light(state.x), self._sensitivity(A, image), momentum, knots)
 
