@@ -110,8 +110,8 @@ class Refinement(eqx.Module):
         Width of a wide voxel in narrow ones. Pixels are wider by the same factor.
     """
 
-    rows: Float[Array | np.ndarray, "row wide_row"]
-    columns: Float[Array | np.ndarray, "column wide_column"]
+    rows: Float[Array | np.ndarray, "row tall"]
+    columns: Float[Array | np.ndarray, "column wide"]
     factor: Float[Array | np.ndarray, ""]
 
     @classmethod
