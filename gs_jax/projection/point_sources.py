@@ -151,6 +151,7 @@ def _add_points(tiles: Array | None, points: Points, imager: Imager, stamps: Sta
             core = _core(batch[:, 2], imager, stamps)
             spot_arguments = (batch[spots["i"]], spots["j"], *(part[spots["i"]] for part in core))
             tiles = _add_spots(tiles, count, *spot_arguments, imager, depths, kernels, weight)
+    assert tiles is not None
     return tiles
 
 
@@ -285,7 +286,8 @@ def _stamps_of_rings(imager: Imager, depths, tables: PsfCores, size: int) -> Ite
     shapes = STEPS * size, STEPS
 
     def render(core):
-        kernel, waves = render_kernel(core[0], *shapes), render_harmonics(*core, *shapes)
+        profile, harmonics = core
+        kernel, waves = render_kernel(profile, *shapes), render_harmonics(profile, harmonics, *shapes)
         return np.concatenate([kernel[None], waves]).astype(np.float32)
 
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
