@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
+from scipy.ndimage import convolve
 
 import gs_jax as gs
 from gs_jax import Grid
@@ -132,8 +133,7 @@ def test_deconvolution(folder, run, monkeypatch, method):
     psf[[1, 4, 7], [2, 7, 4]] = 1.0
     scene = np.zeros((40, 44))
     scene[rng.integers(0, 40, 30), rng.integers(0, 44, 30)] = 1.0
-    image = gs.ConvolutionOperator(psf[None] / 3, (40, 44)).mv(np.pad(scene, ((4, 4), (4, 4)))[None])
-    tifffile.imwrite("c.tif", (1e4 * np.asarray(image)[:40, :44]).clip(0).astype(np.uint16))
+    tifffile.imwrite("c.tif", (3e3 * convolve(scene, psf, mode="constant")).astype(np.uint16))
     tifffile.imwrite("p.tif", (1e4 * psf).astype(np.uint16))
     how = ("deconvolve", "c.tif", "p.tif", "--depths", "20", "--voxel-um", "10", "--method", method)
     how += (*(("--tv", "1e-4") if method == "admm" else ()), "--steps", "60")

@@ -30,8 +30,8 @@ from ..base.workers import Workers
 from ..io.files import TILES, atomic_write, make_folder
 from ..io.ngff import VolumeSeries, open_levels, tile_unit
 from ..microscope.grid import Grid
-from ..solvers.admm import ADMM, Iterate
-from ..solvers.base import differences, start_solver
+from ..solvers.admm import ADMM
+from ..solvers.base import start_solver
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from .pipeline import BackProjection, Reconstructor, State
@@ -307,11 +307,8 @@ def _started(local: Reconstructor, state: State, field: Field, so_far: Volume) -
     state = state._replace(light=state.light - local.problem.detrend(rest))
     solver = with_weights(start_solver(method, state.light, local.problem), method, field.unit)
     if isinstance(method, FISTA):
+        # Not ADMM: with more steps it fits errors of the model.
         solver = solver._replace(x=start, point=jnp.copy(start))
-    else:
-        own = local.problem.detrend(own)
-        iterate, sums = Iterate(start, own, _back(local.problem, own)), (differences(start), jnp.copy(start))
-        solver = solver._replace(iterate=iterate, sums=sums)
     return state._replace(solver=solver)
 
 
