@@ -142,25 +142,8 @@ def reconstruct_tiles(
 ) -> None:
     """Reconstruct a capture tile by tile, in this process or by workers, and write each as it is done.
 
-    Parameters
-    ----------
-    plan
-        Method and grid of the whole volume.
-    tiles
-        From `make_tiles`.
-    capture
-        The image.
-    series
-        Store of the volume, with `tile=tiles.side`. What it has is kept, and so is what its tiles share.
-    workers
-        Other processes, entered, or none.
-    progress
-        Shows progress.
-
-    Raises
-    ------
-    InputError
-        If every tile failed.
+    `series` is the store of the volume, with `tile=tiles.side`. What it has is kept, and so is what its tiles share.
+    `workers` are entered. Raises `InputError` if every tile failed.
     """
     if series.exists and not series.unfinished:
         return
@@ -241,12 +224,12 @@ def _prepare(whole: Reconstructor, plan: Plan, tiles: Tiles, capture: Image, pro
     field = Field(capture, np.asarray(wide.finish(state, progress), np.float32))
     if isinstance(plan.method, BackProjection):
         return field
-    is_lucy, light, total, largest = isinstance(plan.method, RichardsonLucy), whole.init(capture, ()).light, 0.0, 0.0
+    light, total, largest = whole.init(capture, ()).light, 0.0, 0.0
+    if is_lucy := isinstance(plan.method, RichardsonLucy):
+        light = jnp.ones_like(light)
     for number in range(tiles.count):
         problem = _at(whole, tiles.window_grid(number)).problem
-        back = np.asarray(_back(problem, jnp.ones_like(light) if is_lucy else light))[
-            (slice(None), *tiles.inner(number))
-        ]
+        back = np.asarray(_back(problem, light))[(slice(None), *tiles.inner(number))]
         total, largest = total + float(back.sum(dtype=float)), max(largest, float(back.max()))
     if is_lucy and (knots := state.solver.knots) is not None:
         # The light of a pixel, not of a wide one.
@@ -268,8 +251,7 @@ def _field_image(whole: Reconstructor, tiles: Tiles, so_far: Callable[[int], Vol
     image = 0
     for number in progress.track(range(tiles.count), "Imaging the field"):
         problem, inner = _at(whole, tiles.window_grid(number)).problem, (slice(None), *tiles.inner(number))
-        structure = problem.in_structure()
-        part = np.zeros(structure.shape, structure.dtype)
+        part = np.zeros(problem.grid.volume_shape, problem.in_structure().dtype)
         part[inner] = so_far(number)[inner]
         image = image + np.asarray(_image(problem, part))
     return image
@@ -300,9 +282,9 @@ def _started(local: Reconstructor, state: State, field: Field, so_far: Volume) -
             sensitivity = jnp.where(sensitivity > 0, jnp.maximum(sensitivity, least), 0)
         # No step lights a voxel that is dark.
         x = jnp.where(sensitivity > 0, (1 - _UNIFORM) * start + _UNIFORM * start.mean(), 0)
-        # A copy, as steps overwrite their state.
+        # Copies, as steps overwrite their state.
         momentum = solver.momentum and (jnp.copy(x), *solver.momentum[1:])
-        knots = None if field.knots is None else jnp.asarray(field.knots, x.dtype)
+        knots = None if field.knots is None else jnp.array(field.knots, x.dtype)
         return state._replace(solver=solver._replace(x=x, sensitivity=sensitivity, momentum=momentum, knots=knots))
     state = state._replace(light=state.light - local.problem.detrend(rest))
     solver = with_weights(start_solver(method, state.light, local.problem), method, field.unit)
