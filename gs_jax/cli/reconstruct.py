@@ -352,10 +352,14 @@ def deconvolve_command(
             )
             partial_outputs[output] = RESUMABLE
             choose = method == "admm" and weights.tv is None
-            deconvolve_tiles(image, spots, solver, parts, series, choose=choose, progress=progress)
+            chosen = deconvolve_tiles(image, spots, solver, parts, series, choose=choose, progress=progress)
             camera.print_corrections()
+            _warn_of_cut_psfs(planes)
             text = f"{depth_range(depths)}, {image.shape[0]} x {image.shape[1]} pixels, {method}"
             click.echo(f"{output}: {text}, {plural(parts.count, 'tile')} of {parts.side} x {parts.side} pixels")
+            _print_smoothness(chosen)
+            change = max(note["change"] for _, note in series.notes())
+            click.echo(f"steps: the last changed a tile by {change:.1g} of it at most")
             return
         if solver is None:
             with progress.step("Filtering"):
@@ -393,14 +397,19 @@ def deconvolve_command(
         _print_quality(result)
 
 
-def _print_quality(result):
-    """Print the weight of smoothness that was chosen, the residual, and whether the steps converged."""
-    if chosen := result.smoothness:
+def _print_smoothness(chosen):
+    """Print the weight of smoothness that was chosen, if any."""
+    if chosen:
         error = dict(zip(chosen.tried, chosen.errors, strict=True)).get(chosen.tv, 0)
         click.echo(
             f"smoothness: --tv {chosen.tv:.1g}, which predicts held-out pixels best of {len(chosen.tried)} weights, to "
             f"{error:.2g} of their RMS"
         )
+
+
+def _print_quality(result):
+    """Print the weight of smoothness that was chosen, the residual, and whether the steps converged."""
+    _print_smoothness(result.smoothness)
     if result.reached_noise:
         end = "stopped where only noise is left"
     elif result.converged:

@@ -64,8 +64,8 @@ def deconvolve_tiles(
     tiles
         From `scene_tiles`.
     series
-        Store of the scene, with `tile=tiles.side`; the journal has the steps, the residual and the last change of each
-        tile. What it has is kept.
+        Store of the scene, with `tile=tiles.side`. What it has is kept; its journal has each tile's steps and last
+        change.
     """
     progress = progress or Progress()
     light, unit = light_and_unit(image)
@@ -77,6 +77,7 @@ def deconvolve_tiles(
     if choose:
         smoothness = choose_smoothness(light, spots, solver, progress)
         solver = dataclasses.replace(solver, tv=smoothness.tv)
+        series.provenance = {**series.provenance, "tv": f"{smoothness.tv:.3g}, chosen from the capture"}
     largest = 1.0
     if not isinstance(solver, RichardsonLucy):
         windows = (tiles.window(number) for number in range(tiles.count))
