@@ -1,6 +1,7 @@
 """Volumes in tiles: as the whole where they meet, resumed as if nothing had happened, and by workers."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,7 +120,8 @@ def test_a_pyramid_of_tiles(folder, run, monkeypatch):
     monkeypatch.setattr(ngff, "CHUNK", 16)
     bars(folder)
     assert run(*TILED, "-o", "v.zarr")[0] == 0
-    levels = [zarr.open_group("v.zarr", mode="r")[name] for name in "012"]
+    group: Any = zarr.open_group("v.zarr", mode="r")
+    levels = [group[name] for name in "012"]
     assert [level.shape for level in levels] == [(3, 39, 33), (3, 20, 17), (3, 10, 9)]
     assert [level.shards for level in levels] == [(3, 16, 16), (3, 8, 8), (3, 4, 4)]
     volume = read_volume("v.zarr")[0]

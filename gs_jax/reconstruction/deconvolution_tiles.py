@@ -19,6 +19,7 @@ from ..base.typing import Image, Volume
 from ..io.ngff import VolumeSeries, tile_unit
 from ..linear.measured_psf import ConvolutionOperator
 from ..microscope.grid import Grid
+from ..solvers.admm import ConvolutionADMM
 from ..solvers.base import estimate_of, run_solver, start_solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from .deconvolution import (
@@ -31,7 +32,7 @@ from .deconvolution import (
     normalise_spots,
 )
 from .recording import reconstruct_frames
-from .tiles import Tiles, with_weights
+from .tiles import Tiles, largest_side, with_weights
 
 
 def scene_tiles(
@@ -42,8 +43,7 @@ def scene_tiles(
     if side is None:
         # The capture, and the same in its unit.
         memory = available_memory() - 8 * math.prod(grid.shape)
-        most = math.sqrt(max(memory, 1) / (4 * ARRAYS[type(solver)] * len(psf))) - 2 * widest
-        side = min(2 ** int(math.log2(max(most, unit))), max(grid.shape))
+        side = largest_side(grid.shape, memory / (4 * ARRAYS[type(solver)] * len(psf)), 2 * widest)
     return Tiles(grid, -(-side // unit) * unit, -(-widest // 2))
 
 
@@ -74,7 +74,7 @@ def deconvolve_tiles(
     system = ConvolutionOperator(spots, tiles.shape)
     check_memory(solver, system)
     smoothness = None
-    if choose:
+    if choose and isinstance(solver, ConvolutionADMM):
         smoothness = choose_smoothness(light, spots, solver, progress)
         solver = dataclasses.replace(solver, tv=smoothness.tv)
         series.provenance = {**series.provenance, "tv": f"{smoothness.tv:.3g}, chosen from the capture"}

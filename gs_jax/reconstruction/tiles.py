@@ -119,10 +119,16 @@ def make_tiles(plan: Plan, side: int | None, jobs: int = 1) -> Tiles:
     margin = 0 if isinstance(plan.method, BackProjection) else _MARGIN
     if side is None:
         memory = available_memory() / jobs - _PROGRAMS - 4 * _IMAGES * math.prod(plan.imager.sensor.shape)
-        most = math.sqrt(max(memory, 1) / (4 * arrays * grid.depths.size)) - 2 * margin
-        # Powers of two divide into chunks.
-        side = min(2 ** int(math.log2(max(most, unit))), max(grid.shape))
+        side = largest_side(grid.shape, memory / (4 * arrays * grid.depths.size), 2 * margin)
     return Tiles(grid, -(-side // unit) * unit, margin)
+
+
+def largest_side(shape: tuple[int, int], voxels: float, around: int) -> int:
+    """Largest power of two, which divides into chunks, for which the voxels of a plane are enough, with those around.
+
+    At most the side of the grid, and at least what tiles need.
+    """
+    return min(2 ** int(math.log2(max(math.sqrt(max(voxels, 1)) - around, tile_unit(shape)))), max(shape))
 
 
 class Field(NamedTuple):
