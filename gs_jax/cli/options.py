@@ -25,6 +25,8 @@ _MAX_DEPTHS = 10_000
 _FARTHEST = 2000.0
 # Nearest depth that a file of volumes may have, mm.
 NEAREST = 1e-6
+# Voxels along the side of a tile, which its margin would otherwise outnumber.
+_LEAST_TILE = 16
 
 METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled", "surface")
 SUPPRESSIONS = ("none", "points", "clusters", "unet")
@@ -135,8 +137,15 @@ def shipped_designs() -> list[Path]:
     return sorted((inside if inside.is_dir() else Path(__file__).parents[2] / "design").glob("*.toml"))
 
 
+def _tile_side(text: str) -> int | str:
+    if text == "auto" or text.isdecimal() and int(text) >= _LEAST_TILE:
+        return text if text == "auto" else int(text)
+    raise click.BadParameter(f"must be auto, or voxels along a side, {_LEAST_TILE} or more, got {text!r}.")
+
+
 DesignPath = Annotated[Path, Parsed("design", find_design)]
 Page = Annotated[int | str, Parsed("n|mean", _page)]
+TileSide = Annotated[int | str, Parsed("auto|voxels", _tile_side)]
 _DEPTHS = "start:stop:step|z,z,..."
 DepthList = Annotated[list[float], Parsed(_DEPTHS, parse_depths)]
 # From the sample's surface, where 0 is a depth; and of any mask, whose objects may be metres away.

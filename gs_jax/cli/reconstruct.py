@@ -13,11 +13,13 @@ from ..base.errors import InputError, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output
 from .commands import (
+    RESUMABLE,
     OptionGroup,
     check_may_write,
     check_outputs,
     command,
     given_options,
+    partial_outputs,
     plural,
     print_warning,
     provenance_of,
@@ -36,13 +38,14 @@ from .options import (
     PictureOptions,
     SampleDepthList,
     Steps,
+    TileSide,
     Um,
     WorkerOptions,
     check_even,
     depth_range,
     voxels,
 )
-from .recordings import RecordingOptions, SeriesRun, format_residual
+from .recordings import RecordingOptions, SeriesRun, format_residual, request_of
 
 
 @dataclass
@@ -87,6 +90,7 @@ def reconstruct_command(
     points: Path | None = None,
     surface: Path | None = None,
     score: bool = False,
+    tiles: TileSide | None = None,
     light: DepthLight,
     recording: RecordingOptions,
     workers: WorkerOptions,
@@ -121,6 +125,8 @@ def reconstruct_command(
             in mm.
         score: Also reconstruct four times without a quarter of the lenses, predict their light, and tell how well: a
             score without ground truth.
+        tiles: Compute and write a large volume to VOLUME.zarr in tiles, squares of so many voxels a side, or of as many
+            as fit into memory. --resume, --workers and --scheduler are as for recordings.
     """
     from ..design.design import read_design
     from ..io.point_tables import write_points
@@ -160,6 +166,7 @@ def reconstruct_command(
     if recording.warm_start and workers.remote:
         raise InputError("--warm-start must be used without --workers and --scheduler, which take frames in any order.")
     further: dict[str, Any] = {"points": points is not None, "warm_start": bool(recording.warm_start)}
+    further["in_tiles"] = tiles is not None
     plan = Plan.from_options(imager, from_array, voxel_um and voxel_um / 1000, **vars(options), **further)
     series = SeriesRun(capture, output, points, plan, camera, frame, microscope, recording, workers, force)
     if recording.watch:
@@ -167,6 +174,8 @@ def reconstruct_command(
         with Progress() as progress:
             return series.watch(progress)
     with open_recording(capture, page=camera.page) as frames, Progress() as progress:
+        if tiles is not None:
+            return series.reconstruct_in_tiles(None if tiles == "auto" else int(tiles), frames, progress)
         if series.check(frames):
             with workers:
                 return series.reconstruct(frames, progress)
@@ -244,6 +253,8 @@ def deconvolve_command(
     psf_places: Path | None = None,
     binning: Binning = 1,
     output: Path,
+    tiles: TileSide | None = None,
+    resume: bool = False,
     camera: PictureOptions,
 ):
     """Reconstruct the scene in CAPTURE, taken through a diffuser, a lens array or another mask, from measured PSFs.
@@ -281,16 +292,27 @@ def deconvolve_command(
             z, if the PSF varies over the field.
         binning: Sum squares of so many pixels a side, of CAPTURE and PSFs alike: 2 takes a quarter of time and memory.
         output: VOLUME.ome.tif, .npy, or .zarr (with --depths and --voxel-um), float32, planes of CAPTURE's size.
+        tiles: Compute and write a large scene to VOLUME.zarr in tiles, squares of so many pixels a side, or of as many
+            as fit into memory.
+        resume: Keep the tiles that an interrupted run left in VOLUME.zarr, if any, and make the others.
     """
     from ..io.captures import write_capture
+    from ..io.ngff import VolumeSeries
     from ..io.recordings import spot_names
     from ..io.volumes import STACK_SUFFIXES, write_planes
+    from ..microscope.grid import Grid
     from ..reconstruction.deconvolution import SOLVERS, bin_pixels, filter_image, pad_to_largest, run_deconvolution
+    from ..reconstruction.deconvolution_tiles import deconvolve_tiles, scene_tiles
     from ..reconstruction.field_fit import fit_field
     from ..reconstruction.pipeline import method_by_name
 
     files = [path for path in (*psf, psf_places, *camera.files) if path]
-    check_outputs(output, STACK_SUFFIXES, inputs=(capture, *files))
+    check_outputs(None if resume else output, STACK_SUFFIXES, inputs=(capture, *files))
+    if tiles is not None and (output.suffix.lower() != ".zarr" or method == "wiener" or psf_places or stop_at_noise):
+        allowed = "-o VOLUME.zarr, methods that take steps, and without --psf-places and --stop-at-noise"
+        raise InputError(f"--tiles must be used with {allowed}.")
+    if resume and tiles is None:
+        raise InputError("--resume must be used with --tiles.")
     places, solver = None, None
     if method != "wiener":
         solver = method_by_name(SOLVERS, method, steps, vars(weights))
@@ -319,6 +341,26 @@ def deconvolve_command(
         if places is not None:
             with progress.step("Fitting the PSFs"):
                 fit = fit_field(spots, places, image.shape)
+        if tiles is not None:
+            assert solver is not None and depths is not None and voxel_um is not None
+            grid = Grid(depths, image.shape, voxel_um * binning / 1000)
+            parts = scene_tiles(grid, spots, solver, None if tiles == "auto" else int(tiles))
+            provenance = provenance_of(capture, *files)
+            options = {"request": request_of(provenance, None) | {"tiles": str(parts.side)}, "resume": resume}
+            series = VolumeSeries(
+                output, parts.count, grid, **options, provenance=camera.recorded(provenance), tile=parts.side
+            )
+            partial_outputs[output] = RESUMABLE
+            choose = method == "admm" and weights.tv is None
+            chosen = deconvolve_tiles(image, spots, solver, parts, series, choose=choose, progress=progress)
+            camera.print_corrections()
+            _warn_of_cut_psfs(planes)
+            text = f"{depth_range(depths)}, {image.shape[0]} x {image.shape[1]} pixels, {method}"
+            click.echo(f"{output}: {text}, {plural(parts.count, 'tile')} of {parts.side} x {parts.side} pixels")
+            _print_smoothness(chosen)
+            change = max(note["change"] for _, note in series.notes())
+            click.echo(f"steps: the last changed a tile by {change:.1g} of it at most")
+            return
         if solver is None:
             with progress.step("Filtering"):
                 volume = filter_image(image, spots)[None]
@@ -355,14 +397,19 @@ def deconvolve_command(
         _print_quality(result)
 
 
-def _print_quality(result):
-    """Print the weight of smoothness that was chosen, the residual, and whether the steps converged."""
-    if chosen := result.smoothness:
+def _print_smoothness(chosen):
+    """Print the weight of smoothness that was chosen, if any."""
+    if chosen:
         error = dict(zip(chosen.tried, chosen.errors, strict=True)).get(chosen.tv, 0)
         click.echo(
             f"smoothness: --tv {chosen.tv:.1g}, which predicts held-out pixels best of {len(chosen.tried)} weights, to "
             f"{error:.2g} of their RMS"
         )
+
+
+def _print_quality(result):
+    """Print the weight of smoothness that was chosen, the residual, and whether the steps converged."""
+    _print_smoothness(result.smoothness)
     if result.reached_noise:
         end = "stopped where only noise is left"
     elif result.converged:

@@ -22,6 +22,8 @@ from ..base.workers import Workers
 from .commands import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
 from .options import CaptureOptions, Number, Um, objects_in, voxels
 
+# Options that must not be given with tiles.
+_WHOLE = ("points", "surface", "score", "suppress", "stop_at_noise", "watch", "frame_interval", "track", "warm_start")
 # Failed frames that are named; others are only counted, and listed in the journal.
 _MAX_NAMED = 10
 # Options that do not change the volumes.
@@ -44,8 +46,8 @@ class RecordingOptions(OptionGroup):
             column of particle numbers. Needs pip install 'gs-jax[track]'.
         warm_start: Recordings by list-rl or richardson-lucy: start each frame from the volume of the one before, and
             take only the steps that it needs.
-        resume: Recordings: keep the frames that an interrupted run left in VOLUME.zarr, if any, and make the others.
-            Without it, only --force replaces an unfinished VOLUME.zarr.
+        resume: Recordings and --tiles: keep the frames or tiles that an interrupted run left in VOLUME.zarr, if any,
+            and make the others. Without it, only --force replaces an unfinished VOLUME.zarr.
     """
 
     watch: bool = False
@@ -163,6 +165,36 @@ class SeriesRun:
             click.echo(f"gs-jax: {self.output}: {text}; --resume tries them again", err=True)
         return int(bool(series.failed))
 
+    def reconstruct_in_tiles(self, side: int | None, recording, progress: Progress) -> int:
+        """Make and write one volume tile by tile, print a summary, and return the exit status."""
+        from ..io.ngff import VolumeSeries, check_replaceable
+        from ..io.volumes import plain_depths
+        from ..reconstruction.tiles import make_tiles, reconstruct_tiles
+
+        if recording is not None or self.output.suffix.lower() != ".zarr":
+            got = f"{self.output}" if recording is None else f"{len(recording.names)} frames"
+            raise InputError(f"--tiles must be used with one capture and -o VOLUME.zarr, got {got}.")
+        if given := given_options(_WHOLE):
+            raise InputError(f"{given[0]} must not be given with --tiles.")
+        if not (self.options.resume or self.force):
+            check_replaceable(self.output)
+        tiles, image = make_tiles(self.plan, side, self.workers.count or 1), self.camera.read(self.capture)
+        provenance = provenance_of(self.capture, self.plan.weights, *self.camera.files, design=self.design)
+        options = {"request": request_of(provenance, None) | {"tiles": str(tiles.side)}, "resume": self.options.resume}
+        provenance = self.camera.recorded(provenance) | (self.frame.note if self.plan.imager.sample is not None else {})
+        grid = self.frame.grid(self.plan.grid)
+        series = VolumeSeries(self.output, tiles.count, grid, **options, provenance=provenance, tile=tiles.side)
+        partial_outputs[self.output] = RESUMABLE
+        with self.workers:
+            reconstruct_tiles(self.plan, tiles, image, series, self.workers, progress)
+        self.camera.print_corrections()
+        text = voxels(grid.volume_shape, "z, y, x", grid.pitch, plain_depths(grid), self.plan.imager)
+        for line in (text, f"{plural(tiles.count, 'tile')} of {tiles.side} x {tiles.side} voxels"):
+            click.echo(f"{self.output}: {line}")
+        for number, reason in series.failed.items():
+            click.echo(f"gs-jax: tile {number}: {reason}", err=True)
+        return int(bool(series.failed))
+
     def watch(self, progress: Progress) -> None:
         """Make a volume of each capture that comes, until an interrupt, and print a summary."""
         from ..io.captures import read_images
@@ -218,7 +250,7 @@ class SeriesRun:
         from ..io.provenance import input_key
 
         provenance = provenance_of(self.plan.weights, *self.camera.files, design=self.design)
-        request = _request_of(provenance, names)
+        request = request_of(provenance, names)
         source = f"{len(names)} frames, {names[0]} to {names[-1]}" if names else "a folder, as captures came"
         provenance = self.camera.recorded(provenance | {input_key(self.capture): plain_text(source)})
         self.provenance = provenance | (self.frame.note if self.plan.imager.sample is not None else {})
@@ -248,7 +280,7 @@ class SeriesRun:
         return f"{text} of {plural(particles[0], 'particle')}" if self.options.track else text
 
 
-def _request_of(provenance: dict[str, str], names: list[str] | None) -> dict[str, str]:
+def request_of(provenance: dict[str, str], names: list[str] | None) -> dict[str, str]:
     """What the volumes depend on: options, the design, and the contents of the files beside the recording."""
     options = click.get_current_context().params
     request = {name: str(value) for name, value in options.items() if name not in _OTHER_OPTIONS and value is not None}

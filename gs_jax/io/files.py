@@ -31,8 +31,9 @@ _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 # Files that are being written.
 _TEMPORARY: set[Path] = set()
 # Metadata of a Zarr image, and the journal of `VolumeSeries`. A store with anything else in its root (labels, a plate,
-# notes) may hold somebody's work and is not replaced.
+# notes) may hold somebody's work and is not replaced. What tiles share is there until all are written.
 _ZARR_METADATA, JOURNAL = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}, "frames.jsonl"
+TILES = "tiles.npz"
 
 
 # What to do about files of other suffixes.
@@ -147,7 +148,7 @@ def _check_protection(path: Path) -> None:
 
 
 def _is_only_an_image(folder: Path) -> bool:
-    names = set(os.listdir(folder)) - {JOURNAL}
+    names = set(os.listdir(folder)) - {JOURNAL, TILES}
     return bool(names & _ZARR_METADATA) and all(name in _ZARR_METADATA or name.isdecimal() for name in names)
 
 

@@ -1,5 +1,7 @@
 """OME-Zarr (NGFF): attributes of volumes (0.4) and of volumes in time (0.5), which are written frame by frame.
 
+The frames of a large volume are its tiles (0.5).
+
 A volume in time has a file per frame, a shard of Zarr 3; a single volume has one per plane, which readers of Zarr 2
 read too.
 
@@ -95,13 +97,14 @@ def image_attributes(
     voxels: Volume,
     provenance: Provenance | None,
     *,
+    version: str = "0.4",
     in_time: bool = False,
     interval: float | None = None,
 ) -> dict[str, Any]:
     """Attributes of the Zarr group of an image; `InputError` if the depths are not in even, ascending steps.
 
-    `levels` of a pyramid, each of half the rows and columns; `voxels` set the display range; `in_time`: the first axis
-    is time, with `interval` seconds between frames, if they are known.
+    `levels` of a pyramid, each of half the rows and columns; `voxels` set the display range; `version` of OME-Zarr, 0.4
+    or 0.5; `in_time`: the first axis is time, with `interval` seconds between frames, if they are known.
     """
     pitch = grid.pitch
     scale, first = [um(_step(path, depths, pitch)), um(pitch), um(pitch)], [um(depths[0]), *first_um(grid)]
@@ -113,7 +116,7 @@ def image_attributes(
     window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
     channel = {"active": True, "color": "FFFFFF", "label": title(path), "window": window}
     multiscale = {
-        **({} if in_time else {"version": "0.4"}),
+        **({"version": version} if version == "0.4" else {}),
         "name": title(path),
         "axes": axes,
         "datasets": [
@@ -122,7 +125,7 @@ def image_attributes(
         ],
     }
     attributes = {"multiscales": [multiscale], "omero": {"channels": [channel], "rdefs": {"model": "greyscale"}}}
-    attributes = {"ome": {"version": "0.5", **attributes}} if in_time else attributes
+    attributes = attributes if version == "0.4" else {"ome": {"version": version, **attributes}}
     return attributes | ({KEY: dict(provenance)} if provenance else {})
 
 
@@ -169,6 +172,13 @@ def frame_shards(shape: tuple[int, int, int, int]) -> dict[str, Any]:
     }
 
 
+def tile_shards(planes: int, side: int) -> dict[str, Any]:
+    """Storage of a volume in tiles: each tile of `side` x `side` is a file, with squares of its planes as chunks."""
+    chunk = next(side // parts for parts in range(-(-side // CHUNK), side + 1) if side % parts == 0)
+    storage = frame_shards((1, planes, side, side))
+    return storage | {"chunks": (1, chunk, chunk), "shards": (planes, side, side), "dimension_names": tuple("zyx")}
+
+
 def _square(shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(min(n, CHUNK) for n in shape[-2:])
 
@@ -193,6 +203,8 @@ class VolumeSeries:
         Kept in the store.
     resume
         Continue what is there, if anything.
+    tile
+        Side of the tiles of one volume, in voxels: they are its frames, row by row. It is a multiple of `tile_unit`.
 
     Raises
     ------
@@ -210,8 +222,9 @@ class VolumeSeries:
         request: dict[str, str] | None = None,
         provenance: Provenance | None = None,
         resume: bool = False,
+        tile: int | None = None,
     ):
-        self.path, self.grid, self.interval = path, grid, interval
+        self.path, self.grid, self.interval, self.tile = path, grid, interval, tile
         self._declared, self.count = count, count or 0
         # Of frames that were added, and how many of them the journal has.
         self.names: list[str] = []
@@ -227,6 +240,11 @@ class VolumeSeries:
     def unfinished(self) -> list[int]:
         """Frames to make, failed ones included."""
         return [frame for frame in range(self.count) if frame not in self.finished]
+
+    @property
+    def parts(self) -> str:
+        """What its frames are."""
+        return "tiles" if self.tile else "frames"
 
     @property
     def exists(self) -> bool:
@@ -246,9 +264,9 @@ class VolumeSeries:
         """
         if volume is not None:
             if not self._levels:
-                self._create(volume)
+                self.create(volume)
             self._grow()
-            write_frame(self.path, self._levels, frame, volume)
+            write_frame(self.path, self._levels, frame, volume, self.tile)
         self._append({"frame": frame, **(note or {})})
         self.finished.add(frame)
         self.failed.pop(frame, None)
@@ -285,16 +303,19 @@ class VolumeSeries:
         self._append(*({"frame": frame, "name": self.names[frame]} for frame in range(first, count)))
         self._journaled = count
 
-    def _create(self, volume: Volume) -> None:
-        zarr, shapes = import_zarr(), _pyramid(volume.shape[1:])
+    def create(self, volume: Volume) -> None:
+        """Make the store without a frame, with the display range of a volume."""
+        zarr, shapes = import_zarr(), _pyramid(self.grid.shape)
         depths = plain_depths(self.grid)
-        in_time = {"in_time": True, "interval": self.interval}
-        attributes = image_attributes(self.path, depths, self.grid, len(shapes), volume, self.provenance, **in_time)
+        options = {"version": "0.5", "in_time": self.tile is None, "interval": self.interval}
+        attributes = image_attributes(self.path, depths, self.grid, len(shapes), volume, self.provenance, **options)
         with atomic_write(self.path) as temporary:
             group = zarr.create_group(store=temporary, zarr_format=3, attributes=attributes)
             for level, shape in enumerate(shapes):
                 size = (max(self.count, 1), len(depths), *shape)
-                group.create_array(str(level), shape=size, dtype=volume.dtype, **frame_shards(size))
+                storage = tile_shards(len(depths), self.tile >> level) if self.tile else frame_shards(size)
+                size = size[1:] if self.tile else size
+                group.create_array(str(level), shape=size, dtype=volume.dtype, **storage)
             lines = [{"request": self.request, "frames": self._declared}]
             lines += [{"frame": frame, "error": reason} for frame, reason in self.failed.items()]
             text = "".join(json.dumps(line) + "\n" for line in lines)
@@ -337,17 +358,30 @@ def open_levels(path: Path, grid: Grid) -> list[Any]:
     return [group[str(level)] for level in range(len(_pyramid(grid.shape)))]
 
 
-def write_frame(path: Path, levels: list[Any], frame: int, volume: Volume) -> None:
-    """Write the volume of a frame to arrays of `open_levels`: one file each, whole or not at all."""
+def tile_unit(shape: tuple[int, ...]) -> int:
+    """Number of which the side of tiles is a multiple, so that they end between voxels of all levels."""
+    return 2 ** (len(_pyramid(shape)) - 1)
+
+
+def write_frame(path: Path, levels: list[Any], frame: int, volume: Volume, tile: int | None = None) -> None:
+    """Write the volume of a frame, or of a tile, to arrays of `open_levels`: one file each, whole or not at all."""
     zarr = import_zarr()
+    key: tuple[int, ...] = (frame, 0, 0, 0)
+    if tile:
+        key = (0, *divmod(frame, -(-levels[0].shape[-1] // tile)))
     # Plane by plane, as zarr does otherwise, takes twice as long: each is handed to another thread and waited for.
     with disk_errors_name(path, path), zarr.config.set({"codec_pipeline.batch_size": len(volume)}):
         for level, array in enumerate(levels):
             volume = halve(volume) if level else volume
             # Left by a process that was killed while it wrote the frame.
-            for partial in (path / str(level) / "c" / str(frame)).rglob("*.partial"):
+            for partial in Path(path, str(level), "c", *map(str, key[:-1])).glob(f"{key[-1]}.*partial"):
                 partial.unlink(missing_ok=True)
-            array[frame] = volume
+            if tile:
+                first = [at * (tile >> level) for at in key[1:]]
+                place = (slice(None), *(slice(a, a + n) for a, n in zip(first, volume.shape[1:], strict=True)))
+            else:
+                place = frame
+            array[place] = volume
 
 
 def _read_head(path: PathLike) -> tuple[dict[str, str], int | None] | None:
@@ -398,8 +432,9 @@ def check_replaceable(path: Path) -> None:
         return
     done, (_, count) = len(_finished(path)), head
     if count is None or done < count:
+        parts = "tiles of an interrupted run" if "tiles" in head[0] else "frames of an interrupted recording"
         watched = f"{done} frame{'s' * (done != 1)} of a watched folder"
-        frames = watched if count is None else f"{done} of {count} frames of an interrupted recording"
+        frames = watched if count is None else f"{done} of {count} {parts}"
         raise InputError(f"{path}: has {frames}; give --resume to continue it, or --force to replace it.")
 
 

@@ -31,7 +31,7 @@ _CUT, _EDGE = 0.1, 2
 # Arrays of the scene's size that a solver allocates, and for each component of the field. The peaks of 16 to 30 planes
 # of 960 x 960 voxels were 13.7 arrays with ConvolutionADMM, 8.2 with FISTA and 8.6 with Richardson-Lucy; with one
 # component and three, 22.0 and 22.3 with ADMM, 6.9 and 9.4 with FISTA, 7.2 and 13.8 with Richardson-Lucy.
-_ARRAYS, _EACH_COMPONENT = {ConvolutionADMM: 16, ADMM: 18, FISTA: 9, RichardsonLucy: 9}, 4
+ARRAYS, _EACH_COMPONENT = {ConvolutionADMM: 16, ADMM: 18, FISTA: 9, RichardsonLucy: 9}, 4
 
 # Share of an edge within which images fade out.
 _TAPER = 0.05
@@ -192,14 +192,14 @@ def run_deconvolution(
     solver, progress = _DEFAULT if solver is None else solver, progress or Progress()
     if not isinstance(solver, Deconvolver):
         raise InputError(f"solver must be an object such as ConvolutionADMM() or FISTA(), got {short_repr(solver)}.")
-    light, unit = _light(image)
+    light, unit = light_and_unit(image)
     spots = psf if isinstance(psf, FieldConvolutionOperator) else normalise_spots(psf, light.shape)
     system = spots if isinstance(spots, FieldConvolutionOperator) else ConvolutionOperator(spots, light.shape)
     if isinstance(system, FieldConvolutionOperator):
         solver = _of_any_operator(solver)
     elif isinstance(solver, ADMM):
         raise InputError("solver must be ConvolutionADMM() for PSFs that do not vary over the field, got ADMM.")
-    _check_memory(solver, system)
+    check_memory(solver, system)
     smoothness = None
     if choose:
         if not isinstance(solver, ConvolutionADMM | ADMM):
@@ -225,7 +225,7 @@ def filter_image(image: Image, psf: Num[Array | np.ndarray, "*depth high wide"])
     Offsets are subtracted, and values are in the image's unit, as by `deconvolve`. `InputError` as there, and for a
     stack of PSFs.
     """
-    light, unit = _light(image)
+    light, unit = light_and_unit(image)
     spots = normalise_spots(psf, light.shape)
     if len(spots) > 1:
         raise InputError(
@@ -270,7 +270,7 @@ def _tapered(image):
     return image * np.minimum(rows, rows[::-1])[:, None] * np.minimum(columns, columns[::-1])
 
 
-def _light(image):
+def light_and_unit(image):
     """An image above its offset, of the order of 1, which suits the weights of priors; and its unit."""
     check_finite("image", image)
     light = subtract_offset(np.asarray(image, np.float32))
@@ -338,8 +338,9 @@ def _of_any_operator(solver: Deconvolver) -> Deconvolver:
     return ADMM(solver.steps, solver.tolerance, solver.sparsity, solver.tv, solver.isotropic)
 
 
-def _check_memory(solver, system):
-    arrays = _ARRAYS[type(solver)]
+def check_memory(solver, system):
+    """Raise `InputError` if a solver of a scene would not fit into memory."""
+    arrays = ARRAYS[type(solver)]
     if isinstance(system, FieldConvolutionOperator):
         arrays += _EACH_COMPONENT * system.weights.shape[1]
     size = 4 * arrays * math.prod(system.scene_shape)
@@ -347,7 +348,7 @@ def _check_memory(solver, system):
         raise InputError(
             f"psf, image: the solver must take at most {memory / 2**30:.3g} GiB, the free memory, got "
             f"{_size(system.scene_shape)} voxels, for which it takes about {size / 2**30:.3g} GiB; --binning 2 takes a "
-            "quarter."
+            "quarter, --tiles less."
         )
 
 

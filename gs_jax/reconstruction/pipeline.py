@@ -150,7 +150,9 @@ def check_stop(method: Method, stop_at_discrepancy: bool) -> None:
         raise InputError(f"stop_at_discrepancy must be used with {allowed}, got {type(method).__name__}().")
 
 
-def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1) -> Grid:
+def voxel_grid(
+    imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1, in_tiles: bool = False
+) -> Grid:
     """Grid of the field of view, as large as the sensor.
 
     Parameters
@@ -163,6 +165,8 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, 
         Lateral voxel pitch, mm; by default `pixels` as seen at the middle depth, rounded to 0.1 um, at least 0.1 um.
     pixels
         Pixels per voxel of the default pitch.
+    in_tiles
+        Whether the volume is computed in tiles, so that its size does not matter.
 
     Raises
     ------
@@ -175,11 +179,11 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, 
     grid = Grid.over(imager.sensor, depths=jnp.array(depths), pitch=pitch)
     size = 4 * len(depths) * grid.shape[0] * grid.shape[1]
     # The volume, the copy that is being computed, and room for the image.
-    if 2.5 * size > (memory := available_memory()):
+    if not in_tiles and 2.5 * size > (memory := available_memory()):
         shape = " x ".join(map(str, (len(depths), *grid.shape)))
         raise InputError(
             f"--voxel-um, --depths: the volume must take at most {memory / 2.5 / 2**30:.3g} GiB of the free memory, "
-            f"got {shape} voxels of {pitch * 1000:g} um, {size / 2**30:.3g} GiB."
+            f"got {shape} voxels of {pitch * 1000:g} um, {size / 2**30:.3g} GiB; --tiles auto takes any volume."
         )
     return grid
 

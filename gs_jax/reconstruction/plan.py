@@ -85,6 +85,7 @@ class Plan:
         points: bool = False,
         weights: Path | None = None,
         warm_start: bool = False,
+        in_tiles: bool = False,
         **method_options: float | None,
     ) -> "Plan":
         """The plan of some options; `method_options` are those of some methods, `tv` and `sparsity`.
@@ -109,7 +110,8 @@ class Plan:
             raise InputError(f"--warm-start must be used with list-rl or richardson-lucy, got --method {method}.")
         methods = METHODS | ({"unrolled": lambda steps: read_unrolled(weights)} if weights else {})
         solver = method_by_name(methods, method, _STEPS if steps is None else steps, method_options)
-        grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
+        pixels = 1 if method == "backproject" else PIXELS_PER_VOXEL
+        grid = voxel_grid(imager, depths, pitch, pixels=pixels, in_tiles=in_tiles)
         return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights, warm_start)
 
     def prepare(self, progress: Progress) -> "Plan":

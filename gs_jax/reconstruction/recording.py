@@ -64,7 +64,7 @@ def reconstruct_frames(
         If every frame failed: the first one's.
     """
     frames = series.unfinished
-    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as advance:
+    with (progress or Progress()).counter("Reconstructing", len(frames), rate=series.parts) as advance:
         pending: Future[Any] | None = None
         last = None
         reader, writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
@@ -115,8 +115,8 @@ def reconstruct_frames_by(
     """
     frames = series.unfinished
     items = ((frame, series.exists) for frame in frames)
-    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as advance:
-        stream = workers.mapper(partial(_frame_maker, open_frames, series.path, series.grid))
+    with (progress or Progress()).counter("Reconstructing", len(frames), rate=series.parts) as advance:
+        stream = workers.mapper(partial(_frame_maker, open_frames, series.path, series.grid, series.tile))
         for (frame, _), result in stream(items):
             try:
                 volume, note = result()
@@ -129,7 +129,7 @@ def reconstruct_frames_by(
     _check_any_finished(series)
 
 
-def _frame_maker(open_frames, path: Path, grid: Grid):
+def _frame_maker(open_frames, path: Path, grid: Grid, tile: int | None):
     """In a worker: the function that makes a frame, and writes it if the store exists."""
     read, make = open_frames()
     levels = cache(partial(open_levels, path, grid))
@@ -144,7 +144,7 @@ def _frame_maker(open_frames, path: Path, grid: Grid):
         check_finite("volume", volume, "voxels")
         if not exists:
             return volume, note
-        write_frame(path, levels(), frame, volume)
+        write_frame(path, levels(), frame, volume, tile)
         return None, note
 
     return make_frame
