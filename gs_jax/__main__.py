@@ -21,6 +21,7 @@ import click
 
 from ._version import __version__
 from .base.errors import InputError, InputWarning
+from .base.machine import keep_programs
 from .cli.commands import ARGUMENTS, partial_outputs
 from .io.files import remove_temporaries
 
@@ -66,7 +67,8 @@ def main(leave: Callable[[int], object] = sys.exit) -> None:
 
 
 def script() -> None:
-    """Run `main` as a process that ends soon after a signal."""
+    """Run `main` as a process that ends soon after a signal, and finds what the last one compiled."""
+    keep_programs()
     with exit_on_signal():
         main(exit_now)
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 import gs_jax as gs
 from gs_jax.__main__ import COMMANDS, commands, interrupt_message
+from gs_jax.base.machine import keep_programs
 from gs_jax.cli import options
 from gs_jax.cli.commands import RESUMABLE
 from gs_jax.cli.reconstruct import deconvolve_command
@@ -188,6 +189,27 @@ def test_resume_without_a_checkpoint_says_that(folder, run):
     for arguments in (optimize, ("train", "-o", "w.npz")):
         status, _, err = run(*arguments, "--resume")
         assert status == 2 and "--resume must be used after an interrupted run" in err and "study" not in err
+
+
+def test_programs_are_kept_unless_the_user_says_where(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
+    keep_programs()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "mine" and not list(tmp_path.iterdir())
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    keep_programs()
+    folder = Path(os.environ.pop("JAX_COMPILATION_CACHE_DIR"))
+    old, new = folder / "old-cache", folder / "new-cache"
+    old.touch(), new.touch()
+    os.utime(old, (0, 0))
+    keep_programs()
+    assert list(folder.iterdir()) == [new] and folder.is_relative_to(tmp_path)
+    # Without a folder that can be made, programs are not kept.
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(new))
+    keep_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
 
 
 def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):

@@ -4,7 +4,6 @@ import contextlib
 import functools
 import hashlib
 import os
-import sys
 import uuid
 import zipfile
 from collections.abc import Callable, Iterable
@@ -13,6 +12,8 @@ from typing import ParamSpec, TypeVar
 
 import jax
 import numpy as np
+
+from .machine import cache_folder
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -49,18 +50,6 @@ def cached_on_disk(key: Iterable[bytes], compute: Callable[[], dict[str, np.ndar
     with contextlib.suppress(*_NO_CACHE):
         _write(path, arrays)
     return arrays
-
-
-def cache_folder() -> Path:
-    """The folder of this package in the user's cache: `$XDG_CACHE_HOME/gs_jax`, or the platform's.
-
-    Raises `RuntimeError` if the user has no home folder.
-    """
-    if folder := os.environ.get("XDG_CACHE_HOME"):
-        return Path(folder) / "gs_jax"
-    if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):
-        return Path(folder) / "gs_jax" / "Cache"
-    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "gs_jax"
 
 
 def digest_of(key: Iterable[bytes]) -> str:

@@ -1,9 +1,12 @@
 """Versions, devices and memory of this machine. Importing this module does not import JAX."""
 
+import contextlib
 import math
 import os
 import platform
 import sys
+import time
+import zlib
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,9 @@ import psutil
 
 from .._version import __version__
 from .errors import input_error
+
+# Seconds for which compiled programs are kept.
+_KEPT_FOR = 30 * 24 * 3600
 
 
 def describe() -> dict[str, str]:
@@ -71,6 +77,44 @@ def copy_to(device: Any, array: Any) -> Any:
     for kind in (*locked, device.default_memory().kind):
         array = device_put(array, SingleDeviceSharding(device, memory_kind=kind))
     return array
+
+
+def cache_folder() -> Path:
+    """The folder of this package in the user's cache: `$XDG_CACHE_HOME/gs_jax`, or the platform's.
+
+    Raises `RuntimeError` if the user has no home folder.
+    """
+    if folder := os.environ.get("XDG_CACHE_HOME"):
+        return Path(folder) / "gs_jax"
+    if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):
+        return Path(folder) / "gs_jax" / "Cache"
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "gs_jax"
+
+
+def keep_programs() -> None:
+    """Let JAX keep what it compiles in the user's cache folder, for the next process; call it before JAX is imported.
+
+    Not if the user's variables say where, or the folder cannot be written. Another processor has a folder of its own.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    with contextlib.suppress(OSError, RuntimeError):
+        folder = cache_folder() / f"programs-{zlib.crc32(_processor().encode()):08x}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in folder.iterdir():
+            if time.time() - file.stat().st_mtime > _KEPT_FOR:
+                file.unlink(missing_ok=True)
+        if os.access(folder, os.W_OK):
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+            os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+def _processor() -> str:
+    """The processor's instructions, for which programs are compiled, as far as the system tells."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return f"{platform.machine()} {platform.processor()}"
 
 
 def available_memory() -> int:
