@@ -10,7 +10,7 @@ TYPED := --jaxtyping-packages=gs_jax,beartype.beartype
 # Libraries older or newer than the others warn of each other, and other versions of JAX compile other programs.
 SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -o compile_budget= -m "not slow" \
 	$(addprefix tests/test_,imports.py linear_map.py cpu_kernels.py shipped_capture.py solve.py files.py \
-	mold_files.py microscope/media.py solvers.py::test_it_finds_two_bright_voxels_and_nothing_in_the_dark \
+	mold_files.py layers.py solvers.py::test_it_finds_two_bright_voxels_and_nothing_in_the_dark \
 	apertures.py::test_a_compiled_lens_does_not_bound_itself \
 	operators.py::test_transpose_is_backprojection operators.py::test_it_composes_and_solves \
 	operators.py::test_scipy_solves_with_it operators.py::test_pylops_takes_it \

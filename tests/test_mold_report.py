@@ -249,7 +249,7 @@ def test_the_experiment_runs_small():
     small = design()
     (record,) = mold_check.run(small, chords_um=(2.0,))
     assert abs(record["block_filled_error"]) < 1e-6 and abs(record["cast_is_array_error"]) < 1e-12
-    assert len(mold_check.rows([record])[0]) == len(mold_check.COLUMNS)
+    assert set(mold_check.COLUMNS) <= set(record)
 
 
 def test_layers_are_compared_with_the_lenses():
