@@ -279,7 +279,7 @@ def test_a_wrong_image_is_named():
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["a", "b", "c", "d", "i_18_px", "i_20_c", "i_22_my"])
 def test_ray_traced_points_are_found_and_nothing_else(scene):
-    """The bars: 15 um laterally, 120 um axially for the 120 points, uncalibrated; 0.5 % of magnification at 18, 22."""
+    """Uncalibrated: 3 um laterally, and 3 um axially for the 120 points, 20 um for others."""
     needs("geomscope/centers.csv")
     data = needs("oracle/dev/P1.toml").parent
     truth = np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])

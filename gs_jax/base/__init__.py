@@ -1,1 +1,1 @@
-"""Shared utilities: errors, progress, safe arithmetic, caches, the machine and workers."""
+"""Shared utilities: type aliases, errors, progress, safe arithmetic, caches, the machine and workers."""

@@ -1,4 +1,4 @@
-"""Sensor and imager: the map from a point to its image under each lens (Eqs. 1, 3).
+"""Imager: the map from a point to its image under each lens (Eqs. 1, 3).
 
 Every length is in millimetres, the wavelength too. Lateral points are `(x, y)`, images are
 `[row, column]`. The lateral frame is the whole sensor's: origin at its

@@ -1,4 +1,4 @@
-"""The projections for GPUs and TPUs: each voxel, or pixel, sums over the lenses that reach it.
+"""The projections of XLA for GPUs and TPUs: each voxel, or pixel, sums over the lenses that reach it.
 
 The forms in `bilinear` take one lens after the other, as suits a CPU's caches. A GPU would wait for hundreds of small
 kernels. Here the volume, or the image, is cut into square tiles, each with a list of the lenses that reach it, and one
