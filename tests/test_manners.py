@@ -199,10 +199,11 @@ def test_programs_are_kept_unless_the_user_says_where(tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     keep_programs()
-    folder = Path(os.environ.pop("JAX_COMPILATION_CACHE_DIR"))
+    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
     old, new = folder / "old-cache", folder / "new-cache"
     old.touch(), new.touch()
     os.utime(old, (0, 0))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     keep_programs()
     assert list(folder.iterdir()) == [new] and folder.is_relative_to(tmp_path)
     # Without a folder that can be made, programs are not kept.

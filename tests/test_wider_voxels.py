@@ -87,3 +87,22 @@ def test_pixels_that_are_left_out_of_wide_ones_are_not_read(bright_square):
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(wide.kept)[0] == 0), np.arange(5, 10))
     assert not jax.tree.leaves(reconstructor.wider[0].kept)
     np.testing.assert_allclose(part(lit), part(image), rtol=1e-5, atol=1e-7)
+
+
+def test_a_background_is_that_of_wide_pixels_on_these(bright_square):
+    """A number and an image of narrow pixels are the same."""
+    imager, grid, _, image = bright_square
+    shape = gs.Reconstructor(imager, grid, METHODS["richardson-lucy"](4), "pinhole").problem.imager.sensor.shape
+    by = lambda background: gs.RichardsonLucy(4, accelerate=True, background=background, min_sensitivity=0.3)
+    volumes = [gs.Reconstructor(imager, grid, by(b), "pinhole")(image) for b in (5.0, np.full(shape, 5.0))]
+    np.testing.assert_allclose(*volumes, rtol=1e-4, atol=1e-6)
+
+
+def test_solvers_with_steps_of_their_own_take_them_alone(bright_square):
+    class Own(gs.FISTA):
+        def init(self, A, image):
+            return super().init(A, image)
+
+    imager, grid, _, image = bright_square
+    assert not gs.Reconstructor(imager, grid, Own(4), "pinhole").wider
+    assert not gs.Reconstructor(imager, grid, gs.FISTA(4), "pinhole", wide=False).wider

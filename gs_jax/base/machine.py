@@ -101,12 +101,15 @@ def keep_programs() -> None:
     with contextlib.suppress(OSError, RuntimeError):
         folder = cache_folder() / f"programs-{zlib.crc32(_processor().encode()):08x}"
         folder.mkdir(parents=True, exist_ok=True)
-        for file in folder.iterdir():
-            if time.time() - file.stat().st_mtime > _KEPT_FOR:
-                file.unlink(missing_ok=True)
-        if os.access(folder, os.W_OK):
-            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-            os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+        if not os.access(folder, os.W_OK):
+            return
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+        # JAX has folders in it, too; and another process may remove a file first.
+        for file in folder.rglob("*"):
+            with contextlib.suppress(OSError):
+                if file.is_file() and time.time() - file.stat().st_mtime > _KEPT_FOR:
+                    file.unlink()
 
 
 def _processor() -> str:

@@ -45,7 +45,7 @@ from .options import (
     depth_range,
     voxels,
 )
-from .recordings import RecordingOptions, SeriesRun, format_residual, request_of
+from .recordings import RecordingOptions, SeriesRun, format_residual, print_failed_tiles, request_of
 
 
 @dataclass
@@ -54,7 +54,8 @@ class MethodOptions(OptionGroup):
 
     Options:
         method: Back-projection, or an iterative method.
-        steps: Steps of list-rl, richardson-lucy, fista and admm; unrolled and surface have their own. [default: 20]
+        steps: Steps of list-rl, richardson-lucy, fista and admm, in large volumes mostly on wider voxels; unrolled and
+            surface have their own. [default: 20]
         optics: Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.
         tv: Weight of total variation (richardson-lucy, admm).
         sparsity: Weight of the sum of voxels (fista, admm).
@@ -297,7 +298,7 @@ def deconvolve_command(
         resume: Keep the tiles that an interrupted run left in VOLUME.zarr, if any, and make the others.
     """
     from ..io.captures import write_capture
-    from ..io.ngff import VolumeSeries
+    from ..io.ngff import VolumeSeries, check_replaceable
     from ..io.recordings import spot_names
     from ..io.volumes import STACK_SUFFIXES, write_planes
     from ..microscope.grid import Grid
@@ -313,6 +314,8 @@ def deconvolve_command(
         raise InputError(f"--tiles must be used with {allowed}.")
     if resume and tiles is None:
         raise InputError("--resume must be used with --tiles.")
+    if not resume and output.suffix.lower() == ".zarr":
+        check_replaceable(output, "remove it")
     places, solver = None, None
     if method != "wiener":
         solver = method_by_name(SOLVERS, method, steps, vars(weights))
@@ -360,7 +363,7 @@ def deconvolve_command(
             _print_smoothness(chosen)
             change = max(note["change"] for _, note in series.notes())
             click.echo(f"steps: the last changed a tile by {change:.1g} of it at most")
-            return
+            return print_failed_tiles(series)
         if solver is None:
             with progress.step("Filtering"):
                 volume = filter_image(image, spots)[None]

@@ -88,6 +88,8 @@ class SeriesRun:
             given = given_options(vars(options)) or ["--workers or --scheduler"] * self.workers.remote
             if given:
                 raise InputError(f"{given[0]} must be used with a recording, got a single capture {self.capture}.")
+            if self.output.suffix.lower() == ".zarr" and not self.force:
+                check_replaceable(self.output)
             return False
         if self.output.suffix.lower() != ".zarr":
             if recording is None:
@@ -191,9 +193,7 @@ class SeriesRun:
         text = voxels(grid.volume_shape, "z, y, x", grid.pitch, plain_depths(grid), self.plan.imager)
         for line in (text, f"{plural(tiles.count, 'tile')} of {tiles.side} x {tiles.side} voxels"):
             click.echo(f"{self.output}: {line}")
-        for number, reason in series.failed.items():
-            click.echo(f"gs-jax: tile {number}: {reason}", err=True)
-        return int(bool(series.failed))
+        return print_failed_tiles(series)
 
     def watch(self, progress: Progress) -> None:
         """Make a volume of each capture that comes, until an interrupt, and print a summary."""
@@ -278,6 +278,13 @@ class SeriesRun:
         write_points_in_time(path, count(frames), provenance=self.provenance | INTENSITY)
         text = plural(sum(points), "point")
         return f"{text} of {plural(particles[0], 'particle')}" if self.options.track else text
+
+
+def print_failed_tiles(series) -> int:
+    """Name the tiles of a volume that failed and are empty; return the exit status."""
+    for number, reason in series.failed.items():
+        click.echo(f"gs-jax: tile {number}: {reason}", err=True)
+    return int(bool(series.failed))
 
 
 def request_of(provenance: dict[str, str], names: list[str] | None) -> dict[str, str]:

@@ -23,8 +23,9 @@ from ..optics.raytrace import to_numpy
 from .background import SMOOTHING, DetectionImage
 from .view_samples import LensType
 
-# Field points in a field radius, rays of each, and depths.
-_FIELDS, _RAYS, _DEPTHS = 6, 4096, 6
+# Field points in a field radius, and rays of each. Tables are evenly spaced in the reciprocal depth, 1/mm, with a least
+# and a largest number: between them spots are interpolated.
+_FIELDS, _RAYS, _STEP, _LEAST, _MOST = 6, 4096, 0.0025, 6, 48
 # Half the side of the window about a spot's middle that is fitted, pixels, and of its table, which is turned and moved.
 _HALF, _TABLE = 5, 11
 # Bins of a table in a pixel, and how far from the chief ray the middle may be, pixels.
@@ -34,14 +35,17 @@ _PIXEL = math.sqrt(1 / 12)
 # Lenses that hold this part of what is known of a point's depth are used.
 _INFORMATION = 0.9
 # Steps of the fit. A view counts if its light is within this factor of the median and its spot is at most so far from
-# its place, pixels; its own error is at least so large, pixels, as no table is exact.
-_STEPS, _FACTOR, _FARTHEST_SHIFT, _TABLE_ERROR = 2, 3.0, 3.0, 0.05
+# its place, pixels; its own error is at least so large, pixels, as no table is exact. A point is not moved by a larger
+# part of its depth: few lenses side by side do not tell it.
+_STEPS, _FACTOR, _FARTHEST_SHIFT, _TABLE_ERROR, _FARTHEST_MOVE = 2, 3.0, 3.0, 0.05, 0.02
 # Robust weights: Cauchy's, at this multiple of the spread; and how often they are renewed.
 _CAUCHY, _RENEWALS = 2.0, 8
 # Fewest views of a fit, and views that are fitted at once.
 _MIN_VIEWS, _AT_ONCE = 3, 4096
 # Movement of a point for derivatives, mm.
 _MOVE = 1e-3
+# Against divisions by zero.
+_TINY = 1e-30
 
 
 class SpotTables(NamedTuple):
@@ -95,11 +99,18 @@ class Fit(NamedTuple):
     intensities: Float64[np.ndarray, " point"]
 
 
-@cache_by_value(maxsize=8)
-def spot_tables(imager: Imager, near: float, far: float) -> SpotTables:
-    """Trace the spots of the mean lens between two depths, mm."""
+# Captures of a microscope share the tables of all its types of lenses.
+@cache_by_value(maxsize=4)
+def spot_tables(imagers: tuple[Imager, ...], near: float, far: float) -> tuple[SpotTables, ...]:
+    """Trace the spots of the mean lens of each imager between two depths, mm."""
+    count = min(max(math.ceil((1 / near - 1 / far) / _STEP) + 1, _LEAST), _MOST)
+    depths = 1 / np.linspace(1 / near, 1 / far, count)
+    return tuple(_tables(imager, depths) for imager in imagers)
+
+
+def _tables(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> SpotTables:
     imager, height = imager.level()
-    depths, pitch = np.linspace(near, far, _DEPTHS), imager.sensor.pixel_pitch
+    pitch = imager.sensor.pixel_pitch
     fields = imager.field_radius * np.arange(0, RINGS[-1] + 1e-9, 1 / _FIELDS)
     aperture = aperture_profile(imager.array, by_area=False)
     edges = np.arange(-_FARTHEST * _BINS, _FARTHEST * _BINS + 1) / _BINS
@@ -146,15 +157,19 @@ def fit_points(
     positions = np.array(points, np.float64)
     if not len(positions):
         return Fit(positions, np.zeros(0))
-    tables = [spot_tables(one.imager, float(one.depths[0]), float(one.depths[-1])) for one in lens_types]
-    intensities = np.divide(brightness, tables[0].height_at(positions[:, 2]))
+    ends = float(lens_types[0].depths[0]), float(lens_types[0].depths[-1])
+    tables = spot_tables(tuple(one.imager for one in lens_types), *ends)
+    sharp = np.stack([one.sees(positions[:, 2]) for one in lens_types])
+    heights = np.stack([one.height_at(positions[:, 2]) for one in tables])
+    intensities = brightness / (np.maximum((sharp * heights).sum(0), _TINY) / np.maximum(sharp.sum(0), 1))
     for _ in range(_STEPS):
         views = [_find_views(positions, *pair, image.light.shape) for pair in zip(lens_types, tables, strict=True)]
         rest = image.light.copy()
         for one in views:
             np.subtract.at(rest, one.pixels, intensities[one.point, None].astype(np.float32) * one.spot[0])
         fits = [_fit_views(rest, one, intensities) for one in views]
-        move, intensities = _combine(len(positions), *map(np.concatenate, zip(*fits, strict=True)))
+        fits = map(np.concatenate, zip(*fits, strict=True))
+        move, intensities = _combine(positions, intensities, *fits)
         positions += move
     return Fit(positions, intensities)
 
@@ -185,7 +200,8 @@ def _find_views(points, lens_type: LensType, tables: SpotTables, shape: tuple[in
     point, lens = point[sharp], lens[sharp]
     at, views = points[point], imager.views(points[point], lens)
     field = np.hypot(*views.offset.T)
-    along = views.offset / np.maximum(field, 1e-9)[:, None]
+    # On a lens's axis any direction will do.
+    along = np.where(field[:, None] > 0, views.offset / np.maximum(field, _TINY)[:, None], [1.0, 0.0])
     axes = np.stack([along, along[:, ::-1] * [-1, 1]], 1)
     moved = [(imager.views(at + move, lens).spot - views.spot) / _MOVE for move in _MOVE * np.eye(3)]
     slope = np.einsum("vij,kvj->vik", axes, np.stack(moved)) / pitch
@@ -196,7 +212,7 @@ def _find_views(points, lens_type: LensType, tables: SpotTables, shape: tuple[in
         part[use] for part in (point, field, slope, axes, place, middle, core, at[:, 2])
     )
     side = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].reshape(2, 1, -1)
-    row, column = core.T[:, :, None] + side
+    row, column = core.astype(np.int32).T[:, :, None] + side.astype(np.int32)
     down, right = row - place[:, :1], column - place[:, 1:]
     along = axes[:, 0, :1] * right + axes[:, 0, 1:] * down - middle[:, None]
     across = axes[:, 1, :1] * right + axes[:, 1, 1:] * down
@@ -209,12 +225,19 @@ def _find_views(points, lens_type: LensType, tables: SpotTables, shape: tuple[in
 
 def _fit_views(rest, views: _Views, intensities):
     """Light, shift along and across the field, and its variance, of each view by linear least squares."""
-    shape, d_along, d_across = views.spot.astype(np.float64)
-    expected = intensities[views.point]
-    data = rest[views.pixels] + expected[:, None] * shape
+    fits = []
+    for first in range(0, max(len(views.point), 1), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        expected = intensities[views.point[some], None] * views.spot[0, some]
+        data = rest[tuple(part[some] for part in views.pixels)] + expected
+        fits.append(_least_squares(data, *views.spot[:, some].astype(np.float64)))
+    return views.point, views.is_inner, views.slope, *map(np.concatenate, zip(*fits, strict=True))
+
+
+def _least_squares(data, shape, d_along, d_across):
     # A spot that is moved by s is the spot less s times its derivative.
     columns = np.stack([shape, np.ones_like(shape), -d_along, -d_across], -1)
-    scale = np.sqrt((columns**2).sum(1)) + 1e-30
+    scale = np.sqrt((columns**2).sum(1)) + _TINY
     columns /= scale[:, None]
     inverse = np.linalg.inv(np.einsum("vpi,vpj->vij", columns, columns) + 1e-9 * np.eye(4))
     solution = np.einsum("vij,vpj,vp->vi", inverse, columns, data)
@@ -222,36 +245,29 @@ def _fit_views(rest, views: _Views, intensities):
     solution /= scale
     light = np.where(solution[:, 0] > 0, solution[:, 0], np.nan)
     variance = noise[:, None] * np.diagonal(inverse, axis1=1, axis2=2)[:, 2:] / scale[:, 2:] ** 2
-    return (
-        views.point,
-        views.is_inner,
-        views.slope,
-        light,
-        solution[:, 2:] / light[:, None],
-        variance / light[:, None] ** 2,
-    )
+    return light, solution[:, 2:] / light[:, None], variance / light[:, None] ** 2
 
 
-def _combine(count, point, is_inner, slope, light, shift, variance):
-    """Movement and intensity of each of `count` points from all of their views."""
-    move, intensity = np.zeros((count, 3)), np.zeros(count)
+def _combine(positions, intensities, point, is_inner, slope, light, shift, variance):
+    """Movement and intensity of each point from all of its views; without any it keeps its own."""
+    move, intensities = np.zeros(positions.shape), intensities.copy()
     order = np.argsort(point, kind="stable")
-    for number, mine in zip(*_split(point[order], order), strict=True):
+    numbers, first = np.unique(point[order], return_index=True)
+    for number, mine in zip(numbers, np.split(order, first[1:]) if len(first) else [], strict=True):
         lit = mine[np.isfinite(light[mine])]
         # Beyond the field radius a field stop may take the light.
         inner = light[lit[is_inner[lit]]]
-        intensity[number] = np.median(inner) if inner.size else 0.0
-        ratio = light[lit] / max(intensity[number], 1e-30)
+        if not inner.size:
+            continue
+        intensities[number] = np.median(inner)
+        ratio = light[lit] / intensities[number]
         good = lit[(ratio > 1 / _FACTOR) & (ratio < _FACTOR) & (np.abs(shift[lit]) < _FARTHEST_SHIFT).all(-1)]
         if len(good) >= _MIN_VIEWS:
             accuracy = 1 / np.sqrt(variance[good].ravel() + _TABLE_ERROR**2)
-            move[number] = _robust_solution(slope[good].reshape(-1, 3), shift[good].ravel(), accuracy)
-    return move, intensity
-
-
-def _split(point, order):
-    numbers, first = np.unique(point, return_index=True)
-    return numbers, np.split(order, first[1:])
+            found = _robust_solution(slope[good].reshape(-1, 3), shift[good].ravel(), accuracy)
+            if np.abs(found).max() <= _FARTHEST_MOVE * positions[number, 2]:
+                move[number] = found
+    return move, intensities
 
 
 def _robust_solution(matrix, values, accuracy):

@@ -426,7 +426,7 @@ def read_series(path: PathLike) -> Series | None:
         return Series(levels, scale["scale"], places, interval, (window["start"], window["end"]))
 
 
-def check_replaceable(path: Path) -> None:
+def check_replaceable(path: Path, otherwise: str = "--force to replace it") -> None:
     """Raise `InputError` if the path has an unfinished recording, which `VolumeSeries` would replace."""
     if (head := _read_head(path)) is None:
         return
@@ -435,7 +435,7 @@ def check_replaceable(path: Path) -> None:
         parts = "tiles of an interrupted run" if "tiles" in head[0] else "frames of an interrupted recording"
         watched = f"{done} frame{'s' * (done != 1)} of a watched folder"
         frames = watched if count is None else f"{done} of {count} {parts}"
-        raise InputError(f"{path}: has {frames}; give --resume to continue it, or --force to replace it.")
+        raise InputError(f"{path}: has {frames}; give --resume to continue it, or {otherwise}.")
 
 
 def _lines(file) -> Iterator[tuple[Note, int]]:

@@ -39,17 +39,21 @@ _FARTHEST = 1.5
 _FACTORS, _LEAST_VOXELS = (4, 2), 48
 
 
-def prepare_data(image: Image, problem: "InverseProblem") -> tuple[Any, Any]:
+def prepare_data(image: Image, problem: "InverseProblem", side: int = 1) -> tuple[Any, Any]:
     """Bin an image to the problem's pixels, above the camera's offset; return it and the background in it.
+
+    The background is found in pixels of which one of the problem's has `side` along each side.
 
     On the host, unless JAX traces the image. Raises `InputError` if a pixel is not finite.
     """
     check_finite("image", image)
     xp = jnp if is_traced(image) else np
-    light = sum_pixels(subtract_offset(xp.asarray(image, problem.imager.sensor_distance.dtype)), problem.binning)
+    image = subtract_offset(xp.asarray(image, problem.imager.sensor_distance.dtype))
+    light = sum_pixels(image, problem.binning // side)
     if not problem.is_partial:
-        return light, 0.0
-    return light, xp.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0)
+        return sum_pixels(light, side), 0.0
+    background = xp.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0)
+    return sum_pixels(light, side), sum_pixels(background, side)
 
 
 def sum_pixels(image: Any, side: int) -> Any:

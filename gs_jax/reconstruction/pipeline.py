@@ -106,6 +106,8 @@ class PinholeRichardsonLucy(RichardsonLucy):
 
     settled: ClassVar[float] = 0.04
 
+    refined = RichardsonLucy.refined
+
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> LucyState:
         if not getattr(A, "back_projections", None):
             raise InputError(f"PinholeRichardsonLucy() must be used with reconstruct, got a {type(A).__name__}.")
@@ -277,6 +279,8 @@ class Reconstructor(eqx.Module):
     ----------
     imager, grid, method, optics, stop_at_discrepancy, progress
         As for `reconstruct`.
+    wide
+        Whether `solve` may begin on wide voxels; False spares their tables.
 
     Raises
     ------
@@ -307,6 +311,7 @@ class Reconstructor(eqx.Module):
         optics: Optics | str = "full",
         *,
         stop_at_discrepancy: bool = False,
+        wide: bool = True,
         progress: Progress | None = None,
     ):
         _check(method, optics)
@@ -330,7 +335,7 @@ class Reconstructor(eqx.Module):
             warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
         modes = 0 if isinstance(method, RichardsonLucy | Surface) else problem.detrend_modes
         self.problem = dataclasses.replace(problem, back_projections=views, detrend_modes=modes)
-        if isinstance(optics, str) and hasattr(method, "stages"):
+        if wide and isinstance(optics, str) and _begins_wide(method):
             self.wider = tuple(wider_problems(self.problem, imager, optics, progress or Progress()))
         if self.wider and isinstance(method, RichardsonLucy):
             self.views = views or _views(imager, grid, optics)
@@ -342,13 +347,13 @@ class Reconstructor(eqx.Module):
             return state
         return state._replace(solver=start_solver(self._solver(state), state.light, self.problem))
 
-    def _state_of_image(self, image: Image) -> State:
-        """State without that of the solver."""
+    def _state_of_image(self, image: Image, side: int = 1) -> State:
+        """State without that of the solver; pixels are `side` times as wide as those that show the background."""
         _check_image(image, self.image_shape)
         if isinstance(self.method, BackProjection):
             check_finite("image", image)
             return State(image)
-        light, background = prepare_data(image, self.problem)
+        light, background = prepare_data(image, self.problem, side)
         target, counts = 0.0, isinstance(self.method, RichardsonLucy)
         if self.stop_at_discrepancy:
             if is_traced(image):
@@ -394,8 +399,11 @@ class Reconstructor(eqx.Module):
         last: Any = None
         state: Any = None
         for problem, solver in zip((*self.wider, self.problem), stages, strict=True):
+            side = problem.binning // self.problem.binning
+            if isinstance(solver, RichardsonLucy):
+                solver = dataclasses.replace(solver, background=_of_wide_pixels(solver.background, side))
             level = eqx.tree_at(lambda r: (r.problem, r.method, r.wider), self, (problem, solver, ()))
-            start = level._state_of_image(image)
+            start = level._state_of_image(image, side)
             shared = level._solver(start), start.light, problem
             begun = refine_state(state.solver, *shared, refinement(last, problem)) if state else start_solver(*shared)
             if problem is self.problem and isinstance(solver, RichardsonLucy):
@@ -450,6 +458,18 @@ class Reconstructor(eqx.Module):
         kept = xp.repeat(xp.repeat(kept, side, 0), side, 1)
         kept = xp.pad(kept, [(0, n - m) for n, m in zip(image.shape, kept.shape, strict=True)], mode="edge")
         return _quotient(total(kept * image, method.normalize), total(kept, True))
+
+
+def _begins_wide(method: Any) -> bool:
+    """Whether a solver can begin on wide voxels: not if it has `init` or `step` of its own and inherits the rest."""
+    classes = type(method).__mro__
+    place = {name: [name in vars(one) for one in classes].index(True) for name in ("init", "step")}
+    return next((n for n, one in enumerate(classes) if "refined" in vars(one)), len(classes)) <= min(place.values())
+
+
+def _of_wide_pixels(background, side: int):
+    """Light of pixels that are `side` times as wide, a number or an image."""
+    return sum_pixels(background, side) if np.ndim(background) == 2 else side**2 * background
 
 
 def _views(imager, grid, optics) -> tuple[LensTypeGeometry, ...]:

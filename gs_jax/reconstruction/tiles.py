@@ -152,6 +152,7 @@ def reconstruct_tiles(
     `workers` are entered. Raises `InputError` if every tile failed.
     """
     if series.exists and not series.unfinished:
+        shutil.rmtree(series.path / TILES, ignore_errors=True)
         return
     folder, whole = series.path / TILES, _reconstructor(plan, progress)
     first, second = (folder / name for name in _FIELDS)
@@ -215,7 +216,8 @@ def _open_tiles(plan: Plan, tiles: Tiles, path: Path, number: int):
 
 
 def _reconstructor(plan: Plan, progress: Progress, grid: Grid | None = None) -> Reconstructor:
-    return Reconstructor(plan.imager, grid or plan.grid, plan.method, plan.optics, progress=progress)
+    # Tiles take no steps on wide voxels but those of the whole field.
+    return Reconstructor(plan.imager, grid or plan.grid, plan.method, plan.optics, wide=False, progress=progress)
 
 
 def _at(whole: Reconstructor, grid: Grid) -> Reconstructor:

@@ -147,7 +147,7 @@ class RichardsonLucy(eqx.Module):
         return state.x
 
     def stages(self, count: int) -> "list[RichardsonLucy]":
-        return stages(self, count, dataclasses.replace(self, tolerance=max(self.tolerance, self.settled)))
+        return stages(self, count, dataclasses.replace(self, tolerance=self.tolerance or self.settled))
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""
