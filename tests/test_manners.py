@@ -201,7 +201,8 @@ def test_programs_are_kept_unless_the_user_says_where(tmp_path, monkeypatch):
     keep_programs()
     folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
     old, new = folder / "old-cache", folder / "new-cache"
-    old.touch(), new.touch()
+    old.touch()
+    new.touch()
     os.utime(old, (0, 0))
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     keep_programs()

@@ -4,7 +4,7 @@ import json
 import re
 import shlex
 from collections.abc import Iterable, Mapping
-from itertools import repeat, zip_longest
+from itertools import chain, repeat, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +174,9 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     }
     return {
         "sheet": sheet,
-        "tables": [_cells(*both, faults) for both in zip_longest(tables(sheet), TABLES.values(), fillvalue=())],
+        "tables": [
+            _cells(*both, faults) for both in zip(tables(sheet), chain(TABLES.values(), repeat(())), strict=False)
+        ],
         "violations": remarks,
         "device": [summary(design, sheet), *overview(design, sheet)],
         "keys": _device_rows(design),

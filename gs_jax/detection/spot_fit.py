@@ -67,18 +67,15 @@ class SpotTables(NamedTuple):
         middle = self.spots.shape[-1] // 2
         return np.interp(depth, self.depths, self.spots[:, : _FIELDS + 1, 0, middle, middle].mean(1))
 
-    def _between(self, depth, field, part):
+    def _between(self, depth, field, part: np.ndarray) -> np.ndarray:
         """Values of a table at depths and fields, bilinear between their neighbours."""
         at = np.interp(depth, self.depths, np.arange(len(self.depths))), field / self.step
         low = [np.minimum(x.astype(int), n - 2) for x, n in zip(at, part.shape, strict=False)]
-        high = [
-            (x - lower).reshape(-1, *[1] * (part.ndim - 2)).astype(part.dtype) for x, lower in zip(at, low, strict=True)
-        ]
-        return sum(
-            (1 - high[0] if i == 0 else high[0]) * (1 - high[1] if j == 0 else high[1]) * part[low[0] + i, low[1] + j]
-            for i in (0, 1)
-            for j in (0, 1)
-        )
+        shape = -1, *[1] * (part.ndim - 2)
+        down, across = ((x - lower).reshape(shape).astype(part.dtype) for x, lower in zip(at, low, strict=True))
+        upper = (1 - across) * part[low[0], low[1]] + across * part[low[0], low[1] + 1]
+        lower = (1 - across) * part[low[0] + 1, low[1]] + across * part[low[0] + 1, low[1] + 1]
+        return (1 - down) * upper + down * lower
 
     def middle_at(self, depth, field) -> Float64[np.ndarray, " view"]:
         """Middle of the core of each view."""
@@ -133,7 +130,7 @@ def _spot(along, across, light, edges):
     """Middle of one spot's core, and the spot about it as smoothed pixels see it."""
     rays, light = np.stack([np.tile(along, 2), np.concatenate([across, -across])]), np.tile(light / 2, 2)
     blur = _BINS * math.hypot(SMOOTHING, _PIXEL)
-    coarse = gaussian_filter(np.histogram2d(*rays, [edges, edges], weights=light)[0], 2 * blur)
+    coarse = gaussian_filter(np.histogram2d(rays[0], rays[1], [edges, edges], weights=light)[0], 2 * blur)
     peak = edges[np.unravel_index(coarse.argmax(), coarse.shape)[0]] + 0.5 / _BINS
     weight = light * np.exp(-((rays[0] - peak) ** 2 + rays[1] ** 2) / 8)
     middle = (weight @ rays[0]) / weight.sum()
