@@ -15,7 +15,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from ..base.errors import InputError, input_error, short_repr
@@ -200,7 +200,7 @@ def remove_temporaries() -> None:
         _remove(temporary)
 
 
-def _temporary_beside(path: Path) -> Path:
+def _temporary_beside(path: PurePath) -> Any:
     # Not by `tempfile`, whose files only their owner can read: the user's umask decides that.
     return path.with_name(f".gs-jax-{uuid.uuid4().hex[:12]}{path.suffix}")
 

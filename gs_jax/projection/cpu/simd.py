@@ -293,6 +293,8 @@ def _places(builder, address, shift):
 
 
 def _permute(builder, places, first, second):
+    if not HAS_AVX512:  # compiled, but never run
+        return first
     name, kind = "llvm.x86.avx512.vpermi2var.ps.512", ir.FunctionType(FLOATS, [FLOATS, INTEGERS, FLOATS])
     call = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
     return builder.call(call, [first, places, second])
