@@ -13,8 +13,10 @@ from scipy.spatial import KDTree
 
 import gs_jax as gs
 from experiments import point_density
+from gs_jax.detection import spot_fit
+from gs_jax.detection.background import DetectionImage
 from gs_jax.detection.particles import find_clusters
-from gs_jax.detection.view_samples import detection_stats
+from gs_jax.detection.view_samples import detection_stats, lens_types_of
 from gs_jax.microscope.layouts import interleave
 from gs_jax.optics.apertures import clear_area
 from gs_jax.simulation import random_points, simulate_points
@@ -312,3 +314,40 @@ def test_a_hundred_simulated_points_are_found():
     (row,) = point_density.run(gs.geomscope(), {100: 1}, progress=gs.Progress())
     assert row["gs_jax"]["f1"] >= 0.95
     assert row["gs_jax"]["lateral_rmse_um"] <= 15 and row["gs_jax"]["axial_rmse_um"] <= 120
+
+
+def light_of(imager: gs.Imager, points: np.ndarray) -> DetectionImage:
+    """Spots as the tables have them, in the middle of their pixels or between, without noise."""
+    (tables,) = spot_fit.spot_tables((imager,), 18.0, 22.0)
+    lens_type = lens_types_of(imager, np.array([18.0, 22.0]))[0]
+    light = np.zeros(imager.sensor.shape, np.float32)
+    views = spot_fit._find_views(points[:, :3], lens_type, tables, light.shape)
+    np.add.at(light, views.pixels, (points[views.point, 3, None] * views.spot[0]).astype(np.float32))
+    return DetectionImage(light, np.full_like(light, 1e-9))
+
+
+def test_spots_are_fitted_on_an_axis_and_kept_at_the_rim():
+    """A point on a lens's axis has its position and light; one whose spots are all at the rim keeps what it has."""
+    imager, _ = small()
+    center = np.asarray(imager.array.centers[24], np.float64)
+    truth = np.array([[*center, 20.0, 5.0]])
+    image, types = light_of(imager, truth), lens_types_of(imager, np.array([18.0, 22.0]))
+    beside = truth[:, :3] + [0.01, -0.01, 0.1]
+    fit = spot_fit.fit_points(beside, np.array([image.light.max()]), image, types)
+    np.testing.assert_allclose(fit.positions, truth[:, :3], atol=2e-3)
+    np.testing.assert_allclose(fit.intensities, truth[:, 3], rtol=0.02)
+    away = np.array([[60.0, 60.0, 20.0]])
+    fit = spot_fit.fit_points(away, np.array([1.0]), image, types)
+    assert (fit.positions == away).all() and fit.intensities > 0
+
+
+@pytest.mark.parametrize("depths", [(8.0, 32.0), (17.0, 23.0)])
+def test_tables_of_spots_are_close_enough_together(depths):
+    """Between two of them the light in the middle pixel is that of a table traced there."""
+    imager = gs.geomscope().imager()
+    (tables,) = spot_fit.spot_tables((imager,), *depths)
+    between = tables.depths[:-1] + np.diff(tables.depths) / 2
+    between = between[np.abs(between - 20).argsort()[:2]]
+    for z in between:
+        (here,) = spot_fit.spot_tables((imager,), z - 0.01, z + 0.01)
+        np.testing.assert_allclose(tables.height_at(z), here.height_at(z), rtol=0.06)

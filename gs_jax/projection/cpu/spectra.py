@@ -159,10 +159,17 @@ def _list_nonzero(at, fields, listed):
     return mean, count
 
 
+@inline
+def _table_sizes(job):
+    """Harmonics, radii, bytes between two of them, columns and fields of a table, and the depth that is asked for."""
+    harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
+    depth = np.int64(simd.load_int(rows.address(job, 1)))
+    return harmonics, radii, stride, rows.size(job, 0, 1), rows.size(job, 4, 1), depth
+
+
 def add_products(job, part, _):
     """Add each harmonic's products with its table to a sum; a part is some harmonics."""
-    harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
-    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(simd.load_int(rows.address(job, 1)))
+    harmonics, radii, stride, columns, fields, depth = _table_sizes(job)
     memory = rows.allocate(job, columns)
     if memory == 0:
         return rows.FAILED
@@ -192,8 +199,7 @@ def add_products(job, part, _):
 
 def products_back(job, part, _):
     """The adjoint of `add_products`; a part is some harmonics."""
-    harmonics, radii, stride = rows.size(job, 3, 0) // 2, rows.size(job, 3, 1), 4 * rows.size(job, 3, 2)
-    columns, fields, depth = rows.size(job, 0, 1), rows.size(job, 4, 1), np.int64(simd.load_int(rows.address(job, 1)))
+    harmonics, radii, stride, columns, fields, depth = _table_sizes(job)
     memory = rows.allocate(job, columns)
     if memory == 0:
         return rows.FAILED
