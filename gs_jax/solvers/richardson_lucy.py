@@ -49,13 +49,13 @@ _INITIAL_BACKGROUND = 0.02
 class State(NamedTuple):
     """State of `RichardsonLucy`.
 
-    `sensitivity` is `A'1`, by which steps are divided; `momentum` holds the last estimate, update and gain of the
-    accelerated method; `knots` are the values of the fitted background.
+    `sensitivity` is `A'1`, by which steps are divided; `momentum` holds the last estimate of the accelerated method, and
+    the number of steps since it started anew; `knots` are the values of the fitted background.
     """
 
     x: Array
     sensitivity: Array
-    momentum: tuple[Array, Array, Array] | None
+    momentum: tuple[Array, Array] | None
     knots: Float[Array, "knot knot"] | None = None
 
 
@@ -75,8 +75,9 @@ class RichardsonLucy(eqx.Module):
     background
         Light that comes from no voxel, a number or an image.
     accelerate
-        Extrapolate along the last change before each step, by the ratio of the last two updates (Biggs and Andrews,
-        Appl. Opt. 36, 1766, 1997): needs far fewer steps, but is not monotone.
+        Extrapolate along the last change before each step, as Nesterov does (Wang and Miller, IEEE Trans. Image
+        Process. 23, 848, 2014), and start anew when that points away from the image (O'Donoghue and Candes, Found.
+        Comput. Math. 15, 715, 2015): needs far fewer steps, but is not monotone.
     tv
         Weight of total variation, about 1e-3 to 1e-2 (Dey et al., Microsc. Res. Tech. 69, 260, 2006): the step is
         divided by `1 - tv div(grad x / |grad x|)`. 0, kept as None, leaves it out.
@@ -127,7 +128,7 @@ class RichardsonLucy(eqx.Module):
         # The start has as much light as the image; its scale matters only with a background.
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
         x = jnp.where(sensitivity > 0, level, 0)
-        momentum = (x, jnp.zeros_like(x), jnp.zeros((), x.dtype)) if self.accelerate else None
+        momentum = (x, jnp.zeros((), x.dtype)) if self.accelerate else None
         shape = (self.background_knots, self.background_knots)
         knots = jnp.full(shape, _INITIAL_BACKGROUND * jnp.mean(image)) if self.background_knots else None
         return State(x, sensitivity, momentum, knots)
@@ -153,7 +154,7 @@ class RichardsonLucy(eqx.Module):
         """The state on narrower voxels; it goes on with the same momentum."""
         momentum = state.momentum
         if momentum:
-            momentum = refinement.light(momentum[0]), refinement.light(momentum[1]), momentum[2]
+            momentum = refinement.light(momentum[0]), momentum[1]
         knots = None if state.knots is None else state.knots / refinement.factor**2
         return State(refinement.light(state.x), self._sensitivity(A, image), momentum, knots)
 
@@ -174,7 +175,7 @@ def restarted(state: State) -> State:
     seen = state.sensitivity > 0
     uniform = jnp.where(seen, jnp.mean(state.x, where=seen), 0)
     x = (1 - _UNIFORM) * blurred(state.x) + _UNIFORM * uniform
-    momentum = (x, jnp.zeros_like(x), jnp.zeros((), x.dtype)) if state.momentum else None
+    momentum = (x, jnp.zeros((), x.dtype)) if state.momentum else None
     return state._replace(x=x, momentum=momentum)
 
 
@@ -195,7 +196,7 @@ def sharpened(state: State, A: Operator, image: Float[Array, "..."]) -> State:
     detail = agreement(A, image, A.T.mv(jnp.ones_like(image))) ** 2
     # Over about the width of a wide voxel; steps never light a voxel that is dark.
     detail = (1 - _UNIFORM) * divide(detail, blurred(blurred(blurred(detail)))) + _UNIFORM
-    momentum = state.momentum and (detail * state.momentum[0], detail * state.momentum[1], state.momentum[2])
+    momentum = state.momentum and (detail * state.momentum[0], state.momentum[1])
     return state._replace(x=detail * state.x, momentum=momentum)
 
 
@@ -246,8 +247,8 @@ def extrapolate(state: State) -> Float[Array, "..."]:
     """Point from which the next step goes: along the last change, if it is accelerated."""
     if not state.momentum:
         return state.x
-    last, _, gain = state.momentum
-    return jnp.maximum(state.x + gain * (state.x - last), 0)
+    last, count = state.momentum
+    return jnp.maximum(state.x + count / (count + 3) * (state.x - last), 0)
 
 
 def ratio_to_expected(image: Float[Array, "..."], shown: Float[Array, "..."]) -> tuple[Array, Array]:
@@ -267,8 +268,9 @@ def multiplied(
     """State after the step from `point = extrapolate(state)` by the back-projected ratio."""
     new, momentum = divide(point * jnp.maximum(back, 0), state.sensitivity), state.momentum
     if momentum:
-        update, last = new - point, momentum[1]
-        momentum = state.x, update, jnp.clip(divide(jnp.vdot(update, last), jnp.vdot(last, last)), 0, 1)
+        # The slope of the likelihood is `back - A'1`.
+        uphill = jnp.vdot(back - state.sensitivity, new - state.x) >= 0
+        momentum = state.x, jnp.where(uphill, momentum[1] + 1, 0).astype(momentum[1].dtype)
     return State(new, state.sensitivity, momentum, background_step(state.knots, ratio, kept))
 
 
