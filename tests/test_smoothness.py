@@ -13,11 +13,10 @@ from gs_jax.reconstruction.deconvolution import (
     cut_sides,
     deconvolve,
     filter_image,
-    held_out_squares,
     normalise_spots,
     run_deconvolution,
 )
-from gs_jax.reconstruction.inverse_problem import subtract_offset
+from gs_jax.reconstruction.inverse_problem import held_out_squares, subtract_offset
 
 from .helpers import needs
 

@@ -21,7 +21,14 @@ from ..solvers.admm import ADMM, ConvolutionADMM
 from ..solvers.base import estimate_of, run_solver
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
-from .inverse_problem import binned_variance, discrepancy_target, subtract_offset, sum_pixels
+from .inverse_problem import (
+    binned_variance,
+    cell_side,
+    discrepancy_target,
+    held_out_squares,
+    subtract_offset,
+    sum_pixels,
+)
 from .pipeline import DISCREPANCY_FACTOR
 
 # Relative change of the last step below which a solver has converged.
@@ -48,9 +55,6 @@ _FIRST_STEPS, _STEPS = 60, 15
 _WORSE = 0.25
 # Voxels of the scene beyond which pixels are binned for the trials.
 _VOXELS = 2**20
-# Side of the squares that are held out, pixels, and their distance, in sides. Single pixels are told by their
-# neighbours, also where the PSF is wrong: they choose weights that are too weak. In small images squares are smaller.
-_SIDE, _DISTANCE, _LEAST_SQUARES = 8, 4, 16
 # Least error of a square that counts, relative to the mean; and against a division by zero.
 _FLOOR, _TINY = 0.01, 1e-30
 
@@ -426,23 +430,9 @@ def choose_smoothness(
     return Smoothness(scaled[best], scaled, tuple(rms.tolist()))
 
 
-def held_out_squares(shape: tuple[int, ...]) -> Float32[np.ndarray, "row column"]:
-    """0 in squares that are held out, a square in each cell at a pseudo-random place, and 1 elsewhere."""
-    side, rng, kept = _square_side(shape), np.random.default_rng(0), np.ones(shape, np.float32)
-    cell = _DISTANCE * side
-    for corner in np.ndindex(*(-(-n // cell) for n in shape)):
-        row, column = cell * np.array(corner) + rng.integers(0, cell - side, 2, endpoint=True)
-        kept[row : row + side, column : column + side] = 0
-    return kept
-
-
-def _square_side(shape):
-    return max(min(_SIDE, min(shape) // _LEAST_SQUARES), 1)
-
-
 def _squares(error):
     """Sum of the squares of an error in each cell."""
-    cell = _DISTANCE * _square_side(error.shape)
+    cell = cell_side(error.shape)
     rows, columns = (range(0, n, cell) for n in error.shape)
     return np.add.reduceat(np.add.reduceat(error.astype(np.float64) ** 2, rows, 0), columns, 1).ravel()
 

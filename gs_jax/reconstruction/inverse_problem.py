@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Float64, Shaped
+from jaxtyping import Array, Float, Float32, Float64, Shaped
 
 from ..base.arrays import array_namespace, check_finite, is_traced, native
 from ..base.progress import Progress
@@ -28,6 +28,9 @@ from ..solvers.base import Refinement
 _DARK_PERCENTILE = 1
 # Side of the squares in which noise is estimated, pixels.
 _SQUARE = 32
+# Side of the squares that are held out, pixels, and their distance, in sides. Single pixels are told by their
+# neighbours, also where the PSF is wrong: they choose weights that are too weak. In small images squares are smaller.
+_SIDE, _DISTANCE, _LEAST_SQUARES = 8, 4, 16
 # Median absolute value of a standard normal variable.
 _NORMAL_MEDIAN = 0.6745
 # Minimum half wavelength of a background mode, in pixels of the stray light's grid: the width of a spot's stray light.
@@ -115,6 +118,21 @@ def discrepancy_target(
         mean = np.maximum(uniform_filter(np.asarray(light, np.float64), max(_SQUARE // side, 1)), np.sqrt(variance))
         variance = np.divide(variance, mean, out=np.zeros_like(variance), where=mean > 0)
     return float(variance.sum() / 2)
+
+
+def held_out_squares(shape: tuple[int, ...]) -> Float32[np.ndarray, "row column"]:
+    """0 in squares that are held out, a square in each cell at a pseudo-random place, and 1 elsewhere."""
+    cell, rng, kept = cell_side(shape), np.random.default_rng(0), np.ones(shape, np.float32)
+    side = cell // _DISTANCE
+    for corner in np.ndindex(*(-(-n // cell) for n in shape)):
+        row, column = cell * np.array(corner) + rng.integers(0, cell - side, 2, endpoint=True)
+        kept[row : row + side, column : column + side] = 0
+    return kept
+
+
+def cell_side(shape: tuple[int, ...]) -> int:
+    """Side of the cells that have one such square each."""
+    return _DISTANCE * max(min(_SIDE, min(shape) // _LEAST_SQUARES), 1)
 
 
 class LensTypeGeometry(NamedTuple):

@@ -39,6 +39,7 @@ from .inverse_problem import (
     InverseProblem,
     LensTypeGeometry,
     discrepancy_target,
+    held_out_squares,
     lens_type_geometries,
     prepare_data,
     prepare_model,
@@ -115,7 +116,10 @@ class PinholeRichardsonLucy(RichardsonLucy):
 
 
 # Near the edge of the field one lens sees a voxel, in its middle a dozen.
-_LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitivity": 0.3}
+_LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitivity": 0.3, "sieve": (0.0, 1.4)}
+# Steps between two looks at pixels that are held out, the share of the misfit by which they must gain, and by which
+# that of a wider sieve may be larger: volumes show the noise that it takes away before images do.
+_ROUND, _GAIN, _SLACK = 10, 1e-3, 0.25
 
 Method = BackProjection | Solver
 
@@ -255,12 +259,14 @@ def reconstruct(
 class State(NamedTuple):
     """State of a `Reconstructor`: light to explain, of which `background` comes from no voxel, and of the solver.
 
-    No step is taken after one that starts at less than the `target` cost. `cost` and `residual` are of the last step.
+    `sieve` is that of Richardson-Lucy. No step is taken after one that starts at less than the `target` cost. `cost` and
+    `residual` are of the last step.
     """
 
     light: Num[Array | np.ndarray, "row column"]
     background: Any = 0.0
     target: Any = 0.0
+    sieve: Any = None
     solver: Any = None
     cost: Any = np.inf
     residual: Any = np.inf
@@ -367,7 +373,9 @@ class Reconstructor(eqx.Module):
                 light = self.problem.detrend(light)
         if (kept := self.problem.kept) is not None:
             light, target = kept * light, target * kept.mean()
-        return State(jnp.asarray(light), background, target)
+        sieve = getattr(self.method, "sieve", None)
+        sieve = jnp.asarray(sieve[0], light.dtype) if isinstance(sieve, tuple) else sieve
+        return State(jnp.asarray(light), background, target, sieve)
 
     def step(self, state: State) -> State:
         """Take one step; back-projection has none."""
@@ -380,7 +388,7 @@ class Reconstructor(eqx.Module):
         """The volume of a state."""
         if isinstance(self.method, BackProjection):
             return self._backproject(self.method, state.light, progress or Progress())
-        return estimate_of(self.method, state.solver)
+        return estimate_of(self._solver(state), state.solver)
 
     def run(self, state: State, progress: Progress) -> State:
         """Take all steps, or until the method converges or meets the target; overwrites the state of the solver."""
@@ -403,12 +411,56 @@ class Reconstructor(eqx.Module):
             if isinstance(solver, RichardsonLucy):
                 solver = dataclasses.replace(solver, background=_of_wide_pixels(solver.background, side))
             level = eqx.tree_at(lambda r: (r.problem, r.method, r.wider), self, (problem, solver, ()))
-            start = level._state_of_image(image, side)
-            shared = level._solver(start), start.light, problem
-            begun = refine_state(state.solver, *shared, refinement(last, problem)) if state else start_solver(*shared)
-            if problem is self.problem and isinstance(solver, RichardsonLucy):
-                begun = sharpened(begun, dataclasses.replace(problem, back_projections=self.views), start.light)
-            last, state = problem, level.run(start._replace(solver=begun), progress)
+            start, before = level._state_of_image(image, side), (state, last)
+            if self.wider and problem is self.wider[-1] and isinstance(method, RichardsonLucy):
+                state = level._by_held_out(start, before, progress)
+            else:
+                if isinstance(method, RichardsonLucy) and problem is self.problem and state.sieve is not None:
+                    start = start._replace(sieve=2 * state.sieve)
+                begun = level._begun(start, before)
+                if problem is self.problem and isinstance(solver, RichardsonLucy):
+                    back = dataclasses.replace(problem, back_projections=self.views)
+                    begun = begun._replace(solver=sharpened(begun.solver, back, start.light))
+                state = level.run(begun, progress)
+            last = problem
+        return state
+
+    def _begun(self, start: State, before: tuple[Any, Any]) -> State:
+        """State before the first step, from that on wider voxels and their problem, if there is one."""
+        (state, wide), shared = before, (self._solver(start), start.light, self.problem)
+        begun = (
+            start_solver(*shared)
+            if state is None
+            else refine_state(state.solver, *shared, refinement(wide, self.problem))
+        )
+        return start._replace(solver=begun)
+
+    def _by_held_out(self, start: State, before: tuple[Any, Any], progress: Progress) -> State:
+        """State after steps, which end where they predict squares of pixels no better that are held out.
+
+        Of several sieves, the last is taken that predicts them about as well as any after the first steps.
+        """
+        method: Any = self.method
+        squares, kept, steps = held_out_squares(start.light.shape), self.problem.kept, method.steps
+        used, left_out = (part if kept is None else kept * part for part in (squares, 1 - squares))
+        unseen = dataclasses.replace(self.problem, kept=left_out)
+        level = eqx.tree_at(lambda r: r.problem.kept, self, used, is_leaf=lambda leaf: leaf is None)
+        seen = start._replace(light=used * start.light, target=start.target * squares.mean())
+
+        def advanced(state, count):
+            state = level.by(dataclasses.replace(method, steps=count)).run(state, progress)
+            return float(_misfit(level._solver(state), unseen, start.light, state.solver)), state
+
+        sieves = [seen.sieve]
+        if isinstance(method.sieve, tuple):
+            sieves = [jnp.asarray(sieve, start.light.dtype) for sieve in method.sieve]
+        ways = [advanced(level._begun(seen._replace(sieve=s), before), min(_ROUND, steps)) for s in sieves]
+        best = min(error for error, _ in ways)
+        error, state = [way for way in ways if way[0] <= (1 + _SLACK) * best][-1]
+        for taken in range(_ROUND, steps, _ROUND):
+            last, (error, state) = error, advanced(state, min(_ROUND, steps - taken))
+            if error > (1 - _GAIN) * last or state.cost < state.target:
+                break
         return state
 
     def __call__(self, image: Image, progress: Progress | None = None) -> Volume:
@@ -434,7 +486,7 @@ class Reconstructor(eqx.Module):
     def _solver(self, state: State) -> Any:
         method = self.method
         if isinstance(method, RichardsonLucy):
-            return dataclasses.replace(method, background=state.background)
+            return dataclasses.replace(method, background=state.background, sieve=state.sieve)
         return method
 
     def _backproject(self, method: BackProjection, image, progress):
@@ -498,6 +550,11 @@ def _check(method, optics):
 
 
 _quotient = jax.jit(divide)
+
+
+@jax.jit
+def _misfit(solver, A, image, state):
+    return solver.misfit(A, image, state)
 
 
 def _backproject(image, view, grid, interpolation, normalize, progress):

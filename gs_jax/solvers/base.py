@@ -139,13 +139,13 @@ class Refinement(eqx.Module):
         return self.values(volume) / self.factor**2
 
 
-def stages(solver: Any, count: int, last: Any = None) -> list[Any]:
+def stages(solver: Any, count: int, last: Any = None, shares: tuple[float, ...] = _SHARES) -> list[Any]:
     """Stages of a solver on so many grids of wider voxels and on its own, by default a few of its steps."""
 
     def taking(share):
         return dataclasses.replace(solver, steps=math.ceil(share * solver.steps))
 
-    return [*(taking(share) for share in _SHARES[:count]), taking(_LAST_SHARE) if last is None else last]
+    return [*(taking(share) for share in shares[:count]), taking(_LAST_SHARE) if last is None else last]
 
 
 class RESULTS(eqx.Enumeration):
@@ -388,7 +388,7 @@ def none_if_zero(weight: Any) -> Any:
 
 def check_options(solver: Any) -> None:
     """Raise an `InputError` if one of the solver's options is below its minimum."""
-    weights = "tolerance", "sparsity", "tv", "tv_z", "min_sensitivity", "smooth_depth", "smooth_brightness"
+    weights = "tolerance", "sparsity", "tv", "tv_z", "min_sensitivity", "sieve", "smooth_depth", "smooth_brightness"
     for name, minimum in {"steps": 1, "cg_steps": 1, **dict.fromkeys(weights, 0)}.items():
         value = getattr(solver, name, minimum)
         if isinstance(value, int | float) and not value >= minimum:
@@ -413,13 +413,13 @@ def lambda_max(back: Float[Array, "*shape"]) -> Float[Array, ""]:
     return jnp.maximum(jnp.max(back), 0)
 
 
-def blurred(x: Float[Array, "depth y x"]) -> Float[Array, "depth y x"]:
-    """A volume blurred laterally, with a standard deviation of one voxel; zeros are beyond it."""
-    reach = len(_BINOMIAL) // 2
-    for axis in (1, 2):
-        padded = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(3)])
-        shifted = [lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(len(_BINOMIAL))]
-        x = sum((w * part for w, part in zip(_BINOMIAL, shifted, strict=True)), jnp.zeros_like(x))
+def blurred(x: Float[Array, "*depth y x"], weights: Any = _BINOMIAL) -> Float[Array, "*depth y x"]:
+    """A volume blurred laterally, by default with a standard deviation of one voxel; zeros are beyond it."""
+    reach = len(weights) // 2
+    for axis in (x.ndim - 2, x.ndim - 1):
+        padded = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(x.ndim)])
+        shifted = [lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(len(weights))]
+        x = sum((w * part for w, part in zip(weights, shifted, strict=True)), jnp.zeros_like(x))
     return x
 
 

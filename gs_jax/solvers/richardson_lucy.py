@@ -42,6 +42,14 @@ _DARK = 1e-2
 _ROUNDING = 100
 # Uniform share of the volume from which the next image of a recording starts, and of the detail of narrow voxels.
 _UNIFORM = 0.1
+# Steps on voxels four times and twice as wide, of those that it has.
+_SHARES = (2, 2)
+# Widest sieve, voxels, and the reach of its Gaussian.
+_WIDEST_SIEVE, _REACH = 2, 6
+# A width that leaves all as it is.
+_NO_SIEVE = 0.05
+# Least share of a voxel that is left by an extrapolation.
+_LEAST = 0.1
 # Initial level of the background relative to the mean pixel: the voxels explain the light first.
 _INITIAL_BACKGROUND = 0.02
 
@@ -49,7 +57,7 @@ _INITIAL_BACKGROUND = 0.02
 class State(NamedTuple):
     """State of `RichardsonLucy`.
 
-    `sensitivity` is `A'1`, by which steps are divided; `momentum` holds the last estimate of the accelerated method, and
+    `sensitivity` is `A'1`, by which steps are divided; `momentum` holds the last estimate of the accelerated method and
     the number of steps since it started anew; `knots` are the values of the fitted background.
     """
 
@@ -87,11 +95,17 @@ class RichardsonLucy(eqx.Module):
     min_sensitivity
         Lower bound of the sensitivity in steps, relative to the mean: voxels that few pixels see would otherwise take
         the light that an incomplete model cannot explain. 0, kept as None, is no bound.
+    sieve
+        Standard deviation, in voxels, of a lateral Gaussian `K`: the estimate is `K a`, with `a` found for `A K`, so
+        that no noise is finer (Snyder and Miller, IEEE Trans. Nucl. Sci. 32, 3864, 1985). At most 2: wider voxels cost
+        less. 0, kept as None, is no sieve. Of several, from narrow to wide, `reconstruct` takes the last that
+        predicts squares of pixels about as well as any which are held out of steps on wider voxels; and the first in
+        volumes too small for these.
 
     Raises
     ------
     InputError
-        If an option is negative, `steps` is 0, or `background_knots` is 1.
+        If an option is negative, `steps` is 0, `background_knots` is 1, or `sieve` above 2.
 
     Examples
     --------
@@ -112,6 +126,7 @@ class RichardsonLucy(eqx.Module):
     tv: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
     background_knots: int = eqx.field(static=True, default=0)
     min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
+    sieve: Real | tuple[Real, ...] | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
     # Relative change of a step on narrow voxels, after many on wide ones, below which no more are taken.
     settled: ClassVar[float] = 0.015
 
@@ -119,6 +134,9 @@ class RichardsonLucy(eqx.Module):
         check_options(self)
         if self.background_knots == 1 or self.background_knots < 0:
             raise InputError(f"background_knots must be 0, or 2 or more, got {self.background_knots}.")
+        sieves = self.sieve if isinstance(self.sieve, tuple) else (self.sieve,)
+        if any(isinstance(sieve, int | float) and not 0 <= sieve <= _WIDEST_SIEVE for sieve in sieves) or not sieves:
+            raise InputError(f"sieve must be 0 to {_WIDEST_SIEVE} voxels, got {self.sieve}.")
 
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
@@ -136,19 +154,28 @@ class RichardsonLucy(eqx.Module):
     def step(
         self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
-        image = jnp.maximum(as_image(A, image), 0)
-        point, background = extrapolate(state), jnp.asarray(self.background, image.dtype)
-        expected, ratio = ratio_to_expected(image, A.mv(point) + background + bilinear_background(state.knots, image))
-        back = A.T.mv(ratio)
+        image, point = jnp.maximum(as_image(A, image), 0), extrapolate(state)
+        expected, ratio = ratio_to_expected(image, self._shown(A, image, point, state.knots))
+        back = self._sieved(A.T.mv(ratio))
         back = back if self.tv is None else divide(back, _tv_denominator(point, self.tv))
         new = multiplied(state, point, ratio, back, kept_pixels(A))
         return new, kl_divergence(image, expected), divide(norm(new.x - state.x), norm(new.x))
 
+    def misfit(self, A: Operator, image: Float[Array, "..."], state: State) -> Float[Array, ""]:
+        """Kullback-Leibler divergence of the pixels that `A` keeps from those of an estimate."""
+        expected, kept = jnp.maximum(self._shown(A, image, state.x, state.knots), 0), kept_pixels(A)
+        kept = 1 if kept is None else kept
+        return kl_divergence(kept * jnp.maximum(image, 0), kept * expected)
+
     def estimate(self, state: State) -> Float[Array, "..."]:
-        return state.x
+        return self._sieved(state.x)
 
     def stages(self, count: int) -> "list[RichardsonLucy]":
-        return stages(self, count, dataclasses.replace(self, tolerance=self.tolerance or self.settled))
+        """Stages of a solver on so many grids of wider voxels, each twice as narrow as the last, and on its own."""
+        last = dataclasses.replace(self, tolerance=self.tolerance or self.settled)
+        solvers = stages(self, count, last, _SHARES)
+        scaled = lambda wide: jax.tree.map(lambda sieve: sieve / 2**wide, self.sieve)
+        return [dataclasses.replace(one, sieve=scaled(count - i)) for i, one in enumerate(solvers)]
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""
@@ -158,13 +185,27 @@ class RichardsonLucy(eqx.Module):
         knots = None if state.knots is None else state.knots / refinement.factor**2
         return State(refinement.light(state.x), self._sensitivity(A, image), momentum, knots)
 
+    def _shown(self, A, image, x, knots):
+        """The image of a volume before the sieve."""
+        return A.mv(self._sieved(x)) + jnp.asarray(self.background, image.dtype) + bilinear_background(knots, image)
+
     def _sensitivity(self, A, image):
-        """`A'1`, with its lower bound."""
-        sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
+        """`K A'1`, with its lower bound."""
+        sensitivity = self._sieved(_without_rounding(A.T.mv(jnp.ones_like(image))))
         if self.min_sensitivity is None:
             return sensitivity
         minimum = jnp.asarray(self.min_sensitivity, sensitivity.dtype) * jnp.mean(sensitivity)
         return jnp.where(sensitivity > 0, jnp.maximum(sensitivity, minimum), 0)
+
+    def _sieved(self, x):
+        """`K x`, and with the symmetric `K` its adjoint."""
+        if self.sieve is None:
+            return x
+        if isinstance(self.sieve, tuple):
+            raise InputError(f"sieve must be one number but with reconstruct, got {self.sieve}.")
+        width = jnp.maximum(jnp.asarray(self.sieve, x.dtype), _NO_SIEVE)
+        taps = jnp.exp(-0.5 * (jnp.arange(-_REACH, _REACH + 1) / width) ** 2)
+        return blurred(x, taps / taps.sum())
 
 
 def restarted(state: State) -> State:
@@ -248,7 +289,8 @@ def extrapolate(state: State) -> Float[Array, "..."]:
     if not state.momentum:
         return state.x
     last, count = state.momentum
-    return jnp.maximum(state.x + count / (count + 3) * (state.x - last), 0)
+    # No step lights a voxel that is dark.
+    return jnp.maximum(state.x + count / (count + 3) * (state.x - last), _LEAST * state.x)
 
 
 def ratio_to_expected(image: Float[Array, "..."], shown: Float[Array, "..."]) -> tuple[Array, Array]:
