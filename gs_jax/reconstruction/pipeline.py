@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,7 +32,7 @@ from ..solvers.base import (
     take_step,
 )
 from ..solvers.fista import FISTA
-from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState, sharpened
+from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State as LucyState
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from .inverse_problem import (
@@ -104,8 +104,6 @@ class PinholeRichardsonLucy(RichardsonLucy):
     >>> print(volume.argmax() == np.ravel_multi_index((1, 19, 22), volume.shape))
     True
     """
-
-    settled: ClassVar[float] = 0.04
 
     refined = RichardsonLucy.refined
 
@@ -259,7 +257,7 @@ def reconstruct(
 class State(NamedTuple):
     """State of a `Reconstructor`: light to explain, of which `background` comes from no voxel, and of the solver.
 
-    `sieve` is that of Richardson-Lucy. No step is taken after one that starts at less than the `target` cost. `cost` and
+    `sieve` is that of Richardson-Lucy. No step is taken after one that starts below the `target` cost. `cost` and
     `residual` are of the last step.
     """
 
@@ -307,7 +305,6 @@ class Reconstructor(eqx.Module):
     image_shape: tuple[int, int] = eqx.field(static=True)
     stop_at_discrepancy: bool = eqx.field(static=True)
     wider: tuple[InverseProblem, ...] = ()
-    views: tuple[LensTypeGeometry, ...] | None = None
 
     def __init__(
         self,
@@ -343,8 +340,6 @@ class Reconstructor(eqx.Module):
         self.problem = dataclasses.replace(problem, back_projections=views, detrend_modes=modes)
         if wide and isinstance(optics, str) and _begins_wide(method):
             self.wider = tuple(wider_problems(self.problem, imager, optics, progress or Progress()))
-        if self.wider and isinstance(method, RichardsonLucy):
-            self.views = views or _views(imager, grid, optics)
 
     def init(self, image: Image, start: Any = None) -> State:
         """State before the first step; or that of the solver, if given, which `run` overwrites."""
@@ -404,36 +399,30 @@ class Reconstructor(eqx.Module):
         stages = method.stages(len(self.wider)) if self.wider else []
         if not stages:
             return self.run(self.init(image), progress)
-        last: Any = None
+        before: tuple[Any, Any] = (None, None)
         state: Any = None
         for problem, solver in zip((*self.wider, self.problem), stages, strict=True):
             side = problem.binning // self.problem.binning
             if isinstance(solver, RichardsonLucy):
                 solver = dataclasses.replace(solver, background=_of_wide_pixels(solver.background, side))
             level = eqx.tree_at(lambda r: (r.problem, r.method, r.wider), self, (problem, solver, ()))
-            start, before = level._state_of_image(image, side), (state, last)
-            if self.wider and problem is self.wider[-1] and isinstance(method, RichardsonLucy):
+            start = level._state_of_image(image, side)
+            if isinstance(method, RichardsonLucy) and problem is self.wider[-1]:
                 state = level._by_held_out(start, before, progress)
             else:
-                if isinstance(method, RichardsonLucy) and problem is self.problem and state.sieve is not None:
-                    start = start._replace(sieve=2 * state.sieve)
-                begun = level._begun(start, before)
-                if problem is self.problem and isinstance(solver, RichardsonLucy):
-                    back = dataclasses.replace(problem, back_projections=self.views)
-                    begun = begun._replace(solver=sharpened(begun.solver, back, start.light))
-                state = level.run(begun, progress)
-            last = problem
+                if problem is self.problem:
+                    # The one that was chosen, in narrow voxels.
+                    start = start._replace(sieve=jax.tree.map(lambda sieve: 2 * sieve, state.sieve))
+                state = level.run(level._begun(start, before), progress)
+            before = state, problem
         return state
 
     def _begun(self, start: State, before: tuple[Any, Any]) -> State:
         """State before the first step, from that on wider voxels and their problem, if there is one."""
         (state, wide), shared = before, (self._solver(start), start.light, self.problem)
-        begun = (
-            start_solver(*shared)
-            if state is None
-            else refine_state(state.solver, *shared, refinement(wide, self.problem))
-        )
-        return start._replace(solver=begun)
+        if state is None:
+            return start._replace(solver=start_solver(*shared))
+        return start._replace(solver=refine_state(state.solver, *shared, refinement(wide, self.problem)))
 
     def _by_held_out(self, start: State, before: tuple[Any, Any], progress: Progress) -> State:
         """State after steps, which end where they predict squares of pixels no better that are held out.

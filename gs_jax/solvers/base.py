@@ -22,7 +22,7 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 
 # Steps on voxels four times and twice as wide, and on a solver's own, of those that it has.
-_SHARES, _LAST_SHARE = (1.5, 0.4), 0.1
+_SHARES = 1.5, 0.4, 0.1
 # Weights with a standard deviation of one voxel.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
@@ -145,7 +145,7 @@ def stages(solver: Any, count: int, last: Any = None, shares: tuple[float, ...] 
     def taking(share):
         return dataclasses.replace(solver, steps=math.ceil(share * solver.steps))
 
-    return [*(taking(share) for share in shares[:count]), taking(_LAST_SHARE) if last is None else last]
+    return [*(taking(share) for share in shares[:count]), taking(shares[-1]) if last is None else last]
 
 
 class RESULTS(eqx.Enumeration):
@@ -416,7 +416,7 @@ def lambda_max(back: Float[Array, "*shape"]) -> Float[Array, ""]:
 def blurred(x: Float[Array, "*depth y x"], weights: Any = _BINOMIAL) -> Float[Array, "*depth y x"]:
     """A volume blurred laterally, by default with a standard deviation of one voxel; zeros are beyond it."""
     reach = len(weights) // 2
-    for axis in (x.ndim - 2, x.ndim - 1):
+    for axis in range(max(x.ndim - 2, 0), x.ndim):
         padded = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(x.ndim)])
         shifted = [lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(len(weights))]
         x = sum((w * part for w, part in zip(weights, shifted, strict=True)), jnp.zeros_like(x))

@@ -5,7 +5,7 @@ back-projected ratio of the measured to the expected image, which increases the 
 """
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,10 +40,10 @@ _MIN_DENOMINATOR = 0.1
 _DARK = 1e-2
 # Rounding errors of an FFT, in units of the type's precision times the largest sensitivity.
 _ROUNDING = 100
-# Uniform share of the volume from which the next image of a recording starts, and of the detail of narrow voxels.
+# Uniform share of the volume from which the next image of a recording starts.
 _UNIFORM = 0.1
-# Steps on voxels four times and twice as wide, of those that it has.
-_SHARES = (2, 2)
+# Steps on voxels four times and twice as wide, and on its own, of those that it has.
+_SHARES = 2, 1.5, 0.6
 # Widest sieve, voxels, and the reach of its Gaussian.
 _WIDEST_SIEVE, _REACH = 2, 6
 # A width that leaves all as it is.
@@ -127,8 +127,6 @@ class RichardsonLucy(eqx.Module):
     background_knots: int = eqx.field(static=True, default=0)
     min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
     sieve: Real | tuple[Real, ...] | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
-    # Relative change of a step on narrow voxels, after many on wide ones, below which no more are taken.
-    settled: ClassVar[float] = 0.015
 
     def __check_init__(self):
         check_options(self)
@@ -172,9 +170,8 @@ class RichardsonLucy(eqx.Module):
 
     def stages(self, count: int) -> "list[RichardsonLucy]":
         """Stages of a solver on so many grids of wider voxels, each twice as narrow as the last, and on its own."""
-        last = dataclasses.replace(self, tolerance=self.tolerance or self.settled)
-        solvers = stages(self, count, last, _SHARES)
         scaled = lambda wide: jax.tree.map(lambda sieve: sieve / 2**wide, self.sieve)
+        solvers = stages(self, count, shares=_SHARES)
         return [dataclasses.replace(one, sieve=scaled(count - i)) for i, one in enumerate(solvers)]
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
@@ -225,20 +222,6 @@ def agreement(A: Operator, image: Float[Array, "..."], sensitivity: Float[Array,
     dark = _DARK * jnp.mean(image)
     inverse = divide(jnp.ones_like(image), image + dark)
     return jnp.maximum(divide(sensitivity, A.T.mv(inverse)) - dark, 0)
-
-
-@jax.jit
-def sharpened(state: State, A: Operator, image: Float[Array, "..."]) -> State:
-    """State on narrow voxels after steps on wide ones, with the detail that lenses agree on.
-
-    `A.T` is a back-projection. Steps sharpen points slowly: without this, these would need twice as many.
-    """
-    image = jnp.maximum(image, 0)
-    detail = agreement(A, image, A.T.mv(jnp.ones_like(image))) ** 2
-    # Over about the width of a wide voxel; steps never light a voxel that is dark.
-    detail = (1 - _UNIFORM) * divide(detail, blurred(blurred(blurred(detail)))) + _UNIFORM
-    momentum = state.momentum and (detail * state.momentum[0], state.momentum[1])
-    return state._replace(x=detail * state.x, momentum=momentum)
 
 
 def bilinear_background(knots: Float[Array, "knot knot"] | None, image: Float[Array, "..."]) -> Float[Array, "..."]:
