@@ -253,6 +253,35 @@ def test_richardson_lucy_fits_a_slow_background():
     assert error(clean, 3) < 0.1 and not run(0 * clean, 3).any()
 
 
+def test_a_sieve_is_part_of_the_operator_and_of_the_estimate():
+    """By a matrix of a Gaussian's weights, in voxels, along the last axes; its steps never light what none sees."""
+    distance = np.subtract.outer(np.arange(12), np.arange(12))
+    blur = np.where(np.abs(distance) <= 6, np.exp(-(distance**2) / 2 / 1.4**2), 0)
+    blur /= np.exp(-(np.arange(-6, 7) ** 2) / 2 / 1.4**2).sum()
+    image = MATRIX @ RNG.random(12)
+    solver = RichardsonLucy(12, accelerate=True)
+    by_hand = solve(lx.MatrixLinearOperator(jax.device_put(MATRIX @ blur)), image, solver)
+    found = solve(DENSE, image, RichardsonLucy(12, accelerate=True, sieve=1.4))
+    np.testing.assert_allclose(found.value, blur @ np.asarray(by_hand.value), rtol=1e-9)
+    np.testing.assert_allclose(found.stats["costs"], by_hand.stats["costs"], rtol=1e-6)
+    np.testing.assert_allclose(
+        solve(DENSE, image, RichardsonLucy(12, accelerate=True, sieve=jnp.array(0.0))).value,
+        solve(DENSE, image, solver).value,
+        rtol=1e-9,
+    )
+
+
+@pytest.mark.parametrize("sieve", [-0.1, 2.1, (), (0.0, np.nan)])
+def test_a_sieve_has_its_range(sieve):
+    with pytest.raises(InputError, match="sieve must be 0 to 2 voxels"):
+        RichardsonLucy(sieve=sieve)
+
+
+def test_solve_takes_one_sieve():
+    with pytest.raises(InputError, match="sieve must be one number"):
+        solve(DENSE, np.ones(30), RichardsonLucy(1, sieve=(0.0, 1.0)))
+
+
 def test_unexplained_light_does_not_go_to_voxels_that_few_pixels_see():
     """A column of 16 pixels on a voxel of each, but for the last, which half a percent of a pixel sees."""
     A = lx.MatrixLinearOperator(jax.device_put(np.diag([*np.ones(15), 0.005])))

@@ -59,6 +59,8 @@ class MethodOptions(OptionGroup):
         optics: Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.
         tv: Weight of total variation (richardson-lucy, admm).
         sparsity: Weight of the sum of voxels (fista, admm).
+        sieve: Standard deviation, in voxels, of the finest detail (list-rl, richardson-lucy). [default: 1.4, or 0 where
+            large volumes need finer detail to predict pixels that are held out; 0 in small volumes and tiles]
         stop_at_noise: Stop early when all but noise is explained (list-rl to admm in --method).
         suppress: Background suppression: points on which their lenses agree, the paper's clusters, or a network.
         weights: WEIGHTS.npz of `gs-jax train`, for --method unrolled or --suppress unet. [default: ours]
@@ -70,6 +72,7 @@ class MethodOptions(OptionGroup):
     optics: Annotated[str, click.Choice(FIDELITIES)] = "full"
     tv: Annotated[float, Number(0.0, 10.0)] | None = None
     sparsity: Annotated[float, Number(0.0, 1.0)] | None = None
+    sieve: Annotated[float, Number(0.0, 2.0)] | None = None
     stop_at_noise: bool = False
     suppress: Annotated[str, click.Choice(SUPPRESSIONS)] = "none"
     weights: Path | None = None

@@ -430,7 +430,8 @@ class Reconstructor(eqx.Module):
         Of several sieves, the last is taken that predicts them about as well as any after the first steps.
         """
         method: Any = self.method
-        squares, kept, steps = held_out_squares(start.light.shape), self.problem.kept, method.steps
+        kept, steps = self.problem.kept, method.steps
+        squares = held_out_squares(start.light.shape).astype(start.light.dtype)
         used, left_out = (part if kept is None else kept * part for part in (squares, 1 - squares))
         unseen = dataclasses.replace(self.problem, kept=left_out)
         level = eqx.tree_at(lambda r: r.problem.kept, self, used, is_leaf=lambda leaf: leaf is None)

@@ -88,7 +88,7 @@ class Plan:
         in_tiles: bool = False,
         **method_options: float | None,
     ) -> "Plan":
-        """The plan of some options; `method_options` are those of some methods, `tv` and `sparsity`.
+        """The plan of some options; `method_options` are those of some methods: `tv`, `sparsity`, `sieve`.
 
         `steps`: 20 by default, for methods that take steps.
 
@@ -199,9 +199,10 @@ class Plan:
 
 
 class LastVolume(NamedTuple):
-    """State of the last image, its light, and what the last one that took all steps left of its light."""
+    """State of the last image, its sieve and light, and what the last one that took all steps left of its light."""
 
     solver: LucyState
+    sieve: Any
     light: float
     unexplained: float
 
@@ -220,7 +221,7 @@ def follow_volume(
     follows = last is not None and abs(light - last.light) < _COLD_CHANGE * last.light and bool(last.solver.x.any())
     target = _TARGET_RATIO * last.unexplained * light if last and follows else 0.0
     if last and follows:
-        state = reconstructor.init(image, _restart(last.solver))
+        state = reconstructor.init(image, _restart(last.solver))._replace(sieve=last.sieve)
         state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
     else:
         state = reconstructor.solve(image, progress)
@@ -228,7 +229,9 @@ def follow_volume(
     unexplained = last.unexplained if last else 0.0
     if state.cost >= target:
         unexplained = state.cost / light if light > 0 else 0.0
-    return np.asarray(reconstructor.finish(state), np.float32), LastVolume(state.solver, light, unexplained)
+    return np.asarray(reconstructor.finish(state), np.float32), LastVolume(
+        state.solver, state.sieve, light, unexplained
+    )
 
 
 @jax.jit

@@ -388,7 +388,7 @@ def none_if_zero(weight: Any) -> Any:
 
 def check_options(solver: Any) -> None:
     """Raise an `InputError` if one of the solver's options is below its minimum."""
-    weights = "tolerance", "sparsity", "tv", "tv_z", "min_sensitivity", "sieve", "smooth_depth", "smooth_brightness"
+    weights = "tolerance", "sparsity", "tv", "tv_z", "min_sensitivity", "smooth_depth", "smooth_brightness"
     for name, minimum in {"steps": 1, "cg_steps": 1, **dict.fromkeys(weights, 0)}.items():
         value = getattr(solver, name, minimum)
         if isinstance(value, int | float) and not value >= minimum:

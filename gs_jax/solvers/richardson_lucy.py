@@ -45,7 +45,7 @@ _UNIFORM = 0.1
 # Steps on voxels four times and twice as wide, and on its own, of those that it has.
 _SHARES = 2, 1.5, 0.6
 # Widest sieve, voxels, and the reach of its Gaussian.
-_WIDEST_SIEVE, _REACH = 2, 6
+WIDEST_SIEVE, _REACH = 2.0, 6
 # A width that leaves all as it is.
 _NO_SIEVE = 0.05
 # Least share of a voxel that is left by an extrapolation.
@@ -133,8 +133,8 @@ class RichardsonLucy(eqx.Module):
         if self.background_knots == 1 or self.background_knots < 0:
             raise InputError(f"background_knots must be 0, or 2 or more, got {self.background_knots}.")
         sieves = self.sieve if isinstance(self.sieve, tuple) else (self.sieve,)
-        if any(isinstance(sieve, int | float) and not 0 <= sieve <= _WIDEST_SIEVE for sieve in sieves) or not sieves:
-            raise InputError(f"sieve must be 0 to {_WIDEST_SIEVE} voxels, got {self.sieve}.")
+        if any(isinstance(sieve, int | float) and not 0 <= sieve <= WIDEST_SIEVE for sieve in sieves) or not sieves:
+            raise InputError(f"sieve must be 0 to {WIDEST_SIEVE:g} voxels, got {self.sieve}.")
 
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
@@ -201,7 +201,7 @@ class RichardsonLucy(eqx.Module):
         if isinstance(self.sieve, tuple):
             raise InputError(f"sieve must be one number but with reconstruct, got {self.sieve}.")
         width = jnp.maximum(jnp.asarray(self.sieve, x.dtype), _NO_SIEVE)
-        taps = jnp.exp(-0.5 * (jnp.arange(-_REACH, _REACH + 1) / width) ** 2)
+        taps = jnp.exp(-0.5 * (jnp.arange(-_REACH, _REACH + 1, dtype=x.dtype) / width) ** 2)
         return blurred(x, taps / taps.sum())
 
 
