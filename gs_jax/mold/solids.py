@@ -34,6 +34,9 @@ _OVERCUT = 1.0
 _MIN_WALL_HEIGHT = 1e-5
 # Samples per side of the plate in the volume of unequal lenses.
 _VOLUME_SAMPLES = 1400
+# Lenses that others hide from a radius on are cut there, rounded up to such a part of their own: alike lenses share
+# facets.
+_RADII = 32
 # Facets of a solid that is only drawn.
 _PREVIEW_FACETS = 20_000
 
@@ -101,10 +104,13 @@ def array_solid(part: Part, chord: float = 5e-4, *, progress: Progress | None = 
         raise ValueError(f"`chord` of {chord} mm takes about {count:.2g} facets, more than {MAX_FACETS:.2g}.")
     bottom, (x, y) = -part.plate_thickness, part.size
     pairs = list(zip(part.lenslets, part.visible_radii, strict=True))
-    bodies = [
-        _lenslet_body(lenslet, radius, chord, part.height, -bottom / 2)
-        for lenslet, radius in (progress or Progress()).track(pairs, "Tessellating")
-    ]
+    bodies, alike = [], {}
+    for lenslet, visible in (progress or Progress()).track(pairs, "Tessellating"):
+        shape = lenslet.semi_aperture, lenslet.radius, lenslet.conic, lenslet.terms
+        radius = lenslet.semi_aperture * min(math.ceil(_RADII * visible / lenslet.semi_aperture) / _RADII, 1)
+        if (*shape, radius) not in alike:
+            alike[*shape, radius] = _lenslet_body(lenslet, radius, chord, part.height, -bottom / 2)
+        bodies.append(alike[*shape, radius].translate([*lenslet.center.tolist(), 0.0]))
     plate, column = (_box([-x / 2, -y / 2, bottom], [x / 2, y / 2, top]) for top in (0, part.height + _OVERCUT))
     lenses = m3.Manifold.batch_boolean(bodies, m3.OpType.Add) ^ column
     # Built with lenses up; mirroring also reverses the facets of a solid.
@@ -125,7 +131,7 @@ def _box(low, high) -> m3.Manifold:
 
 
 def _lenslet_body(lenslet: Lenslet, radius, chord, top, depth) -> m3.Manifold:
-    """A lenslet, up to a radius, on a wall that reaches `depth` below the base."""
+    """A lenslet about its axis, up to a radius, on a wall that reaches `depth` below the base."""
     points, sag, facets, count = tessellate(lenslet, radius, chord)
     height = top - sag
     if height[:count].max() < _MIN_WALL_HEIGHT:
@@ -138,7 +144,7 @@ def _lenslet_body(lenslet: Lenslet, radius, chord, top, depth) -> m3.Manifold:
     wall = [np.stack([upper, lower, next_lower], axis=1), np.stack([upper, next_lower, next_upper], axis=1)]
     floor = np.stack([np.full(count - 2, lower[0]), lower[2:], lower[1:-1]], axis=1)
     mesh = m3.Mesh64(vertices, np.concatenate([facets, *wall, floor]).astype(np.uint64))
-    return _require_valid(m3.Manifold(mesh)).translate([*lenslet.center.tolist(), 0.0])
+    return _require_valid(m3.Manifold(mesh))
 
 
 def check_part(part: Part) -> None:
