@@ -292,14 +292,15 @@ def simulate_volume(
     if np.min(volume) < 0:
         raise InputError(f"voxels must not be negative, got {np.min(volume):g}.")
     of_depth = _psf_at_depth(imager, grid, kind)
-    image, progress = jnp.zeros(imager.sensor.shape, jnp.float32), progress or Progress()
+    # On the host, where it is added to in place.
+    image, progress = np.zeros(imager.sensor.shape, np.float32), progress or Progress()
     for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
         if not plane.any():
             continue
         fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
         fine_grid = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
-        image += forward(fine[None], imager, fine_grid, of_depth(depth))
-    return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
+        image += np.asarray(forward(fine[None], imager, fine_grid, of_depth(depth)))
+    return np.maximum(image, 0, out=image)  # an FFT's rounding may be below zero
 
 
 def _psf_at_depth(imager, grid, kind):

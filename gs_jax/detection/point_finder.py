@@ -146,19 +146,27 @@ def find_points(
     survival = survival_function(detection.light, least)
     points, samples, own = _accept(np.zeros((0, 3)), detection, survival, lens_types, voxels)
     for _ in range(_SEARCHES):
-        rest = detection._replace(light=own.rest)
-        # A spot between two voxels must not be missed.
-        dilated = rest._replace(light=_dilate(rest.light))
-        new = _candidates(dilated, lens_types, voxels, progress)
+        new = _search(detection._replace(light=own.rest), least, lens_types, voxels, progress)
         with progress.step("Comparing lenses"):
-            views = sample_views_by_type(new, dilated, lens_types)
-            lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
-            new = _refine(new[lit], voxels, rest, lens_types)
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
+    own = own._replace(rest=own.rest[:0])  # as large as the capture
     fit = fit_points(points, view_quantile(own.light, samples.seen, 0.5), detection, lens_types)
     points = np.column_stack([fit.positions, fit.intensities])
     points = points[_inside(points, grid, _step(voxels) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]
+
+
+def _search(
+    rest: DetectionImage, least: float, lens_types: Sequence[LensType], voxels: Grid, progress: Progress
+) -> Positions:
+    """Candidates in an image, refined between the voxels."""
+    # A spot between two voxels must not be missed.
+    dilated = rest._replace(light=_dilate(rest.light))
+    new = _candidates(dilated, lens_types, voxels, progress)
+    with progress.step("Comparing lenses"):
+        views = sample_views_by_type(new, dilated, lens_types)
+        lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
+        return _refine(new[lit], voxels, rest, lens_types)
 
 
 def _ends(grid: Grid) -> tuple[float, float]:
@@ -183,7 +191,9 @@ def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point
 
 def _log_snr(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Logarithm of the signal-to-noise ratio over half the threshold, so that no lens outweighs the others."""
-    return np.log(np.maximum(light / np.where(noise > 0, noise, np.inf) / (THRESHOLD_SNR / 2), 1))
+    snr = np.divide(light, noise, out=np.zeros_like(light), where=noise > 0)
+    snr /= THRESHOLD_SNR / 2
+    return np.log(np.maximum(snr, 1, out=snr), out=snr)
 
 
 def _dilate(light: Pixels) -> Pixels:

@@ -78,15 +78,19 @@ def make_stamps(
         raise ValueError(f"`fine` must be ({len(depths)}, n, n) with n five times an odd number, got {fine.shape}.")
     if (np.diff(depths) <= 0).any():
         raise ValueError(f"`depths` must ascend, got {depths}.")
-    half = STEPS // 2
-    wide = np.pad(fine.reshape(-1, *fine.shape[-2:]), ((0, 0), (half, half), (half, half)), "wrap")
+    return Stamps(depths, np.stack(list(map(_shifted, fine.reshape(len(depths), -1, *fine.shape[-2:])))), ring)
+
+
+def _shifted(fine: Float[np.ndarray, "wave fine fine"]) -> Float[np.ndarray, "wave 5 5 size size"]:
+    """Stamps of one depth, at every fifth of a pixel."""
+    size, half = fine.shape[-1] // STEPS, STEPS // 2
+    wide = np.pad(fine, ((0, 0), (half, half), (half, half)), "wrap")
     # Pixels that begin at every fifth, along one axis after the other; a stamp that is moved up begins later.
     for _ in range(2):
         last = wide.shape[1] - STEPS + 1
         wide = sum((wide[:, step : step + last] for step in range(1, STEPS)), wide[:, :last]).swapaxes(1, 2)
     pixels = wide.reshape(-1, size, STEPS, size, STEPS)[:, :, ::-1, :, ::-1]
-    kernels = pixels.transpose(0, 2, 4, 1, 3).reshape(len(depths), -1, STEPS, STEPS, size, size)
-    return Stamps(depths, np.ascontiguousarray(kernels), ring)
+    return np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3))
 
 
 def forward_points(
@@ -288,12 +292,13 @@ def _stamps_of_rings(imager: Imager, depths, tables: PsfCores, size: int) -> Ite
     def render(core):
         profile, harmonics = core
         kernel, waves = render_kernel(profile, *shapes), render_harmonics(profile, harmonics, *shapes)
-        return np.concatenate([kernel[None], waves]).astype(np.float32)
+        # Depth by depth, so that few copies are held at once.
+        return _shifted(np.concatenate([kernel[None], waves]).astype(np.float32))
 
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
     for edges, distortion, light, *cores in rings:
         kernels = np.stack(list(map_in_threads(render, zip(*cores, strict=True))))
-        yield make_stamps(depths, kernels, Ring(edges, distortion, light))
+        yield Stamps(depths, kernels, Ring(edges, distortion, light))
 
 
 def _full_image(points, imager: Imager, optics: _FullOptics, progress: Progress | None = None) -> np.ndarray:
