@@ -2,8 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,12 +15,14 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
+from ..base.machine import release_memory
 from ..base.progress import Progress
 from ..base.typing import PathLike
+from ..base.workers import run_jobs
 from ..codesign.search import run_study
 from ..codesign.search_report import as_records, write_outcome
 from ..design.datasheets import datasheet, findings
-from ..design.design import Design, write_design
+from ..design.design import write_design
 from ..design.start import geomscope
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
@@ -27,10 +31,11 @@ from ..io.files import make_folder, write_figure, write_json, write_text
 from ..io.point_tables import write_points
 from ..io.volumes import write_volume
 from ..metrics import Localization, Quality, localization, quality
+from ..microscope.geometry import Imager
 from ..microscope.grid import Grid, Sensor
 from ..microscope.layouts import nearest_neighbour_distances
 from ..mold.make import make_mold
-from ..reconstruction.pipeline import reconstruct
+from ..reconstruction.pipeline import Reconstructor, reconstruct
 from ..simulation import Camera, expose, letters, random_points, rasterize, simulate
 from ..solvers.admm import ADMM
 from ..solvers.richardson_lucy import RichardsonLucy
@@ -39,11 +44,12 @@ from .drawings import template
 from .pictures import downsample, draw_image
 from .report import write_report
 
-_SCENE_MM = 0.016  # finer than the voxels and no multiple of them
+# Finer than the voxels and no part of them; a pixel on the sensor at most, where it is divided in two.
+_SCENE_MM = 0.0145
 # Voxels of the words. Networks see planes between and beyond theirs; each step of a solver costs a hundred
 # back-projections, so that solvers have the planes of the words.
 _WORD_DEPTHS, _WORD_PLANES, _WORD_VOXEL_MM = np.arange(17.0, 23.01, 0.5), slice(2, 11, 4), 0.11
-_STEPS = 6
+_STEPS, _LUCY_STEPS = 6, 12
 # Voxels in which points are found.
 _POINT_DEPTHS, _POINT_VOXEL_MM = np.arange(17.0, 23.01, 0.5), 0.0415
 _POINTS = 60
@@ -78,40 +84,79 @@ def run(folder: PathLike, progress: Progress | None = None) -> Path:
     """
     page = template("example_pipeline.md")
     folder, progress = make_folder(folder), progress or Progress()
-    seconds: dict[str, float] = {}
-    with progress.step("Laying out the lenses"), _timed(seconds, "design and metrics"):
-        design = geomscope()
+    design, seconds = geomscope(), {}
+    imager = design.imager()
+    planes = Grid.over(imager.sensor, depths=_WORD_DEPTHS, pitch=_WORD_VOXEL_MM)
+    grid = planes.at(planes.depths[_WORD_PLANES])
+    solvers = {
+        _BEST: Unrolled.pretrained(),
+        f"ADMM, {_STEPS} steps": ADMM(_STEPS),
+        f"Richardson-Lucy, {_LUCY_STEPS} steps": RichardsonLucy(_LUCY_STEPS, accelerate=True),
+    }
+
+    def solve(name: str, image: np.ndarray) -> np.ndarray:
+        # Programs for wide voxels take longer to compile than all steps on so few.
+        with _timed(seconds, name):
+            solver = Reconstructor(imager, grid, solvers[name], wide=False, progress=progress)
+            return solver(image, progress)
+
+    def evaluate() -> dict[str, Any]:
         write_design(folder / "design.toml", design)
-        sheet = datasheet(design)
+        with progress.step("Datasheet"), _timed(seconds, "design and metrics"):
+            sheet = datasheet(design)
         write_json(folder / "metrics.json", sheet)
-    with _timed(seconds, "optimisation"):
-        targets = _optimise(folder, progress)
-    scores, shown = _image_words(folder, design, seconds, progress)
-    points, score = _image_points(folder, design, seconds, progress)
-    with _timed(seconds, "mold"):
-        mold = make_mold(design, folder / "mold.stl", progress=progress)
-    with _timed(seconds, "report"):
-        write_report(folder / "report.html", design, **shown, points=points, notes=_NOTES, progress=progress)
+        return sheet
+
+    def mold() -> dict[str, Any]:
+        with _timed(seconds, "mold"):
+            return make_mold(design, folder / "mold.stl", progress=progress)
+
+    def report(image, volume, points) -> None:
+        shown = {"image": image, "volume": volume, "grid": grid, "points": points[0], "notes": _NOTES}
+        with _timed(seconds, "report"):
+            write_report(folder / "report.html", design, **shown, progress=progress)
+
+    # In an order in which the longest is not last, and what takes much memory is seldom beside its like.
+    jobs = {
+        "image": (partial(_image_words, folder, imager, seconds, progress),),
+        "sheet": (evaluate,),
+        "targets": (partial(_optimise, folder, seconds, progress),),
+        "points": (partial(_image_points, folder, imager, seconds, progress),),
+        _BEST: (partial(solve, _BEST), "image"),
+        "mold": (mold,),
+        "report": (report, "image", _BEST, "points"),
+        **{name: (partial(solve, name), "image") for name in solvers if name != _BEST},
+        "views": (partial(_back_project, imager, planes, seconds, progress), "image"),
+    }
+    results = run_jobs(jobs)
+    truth = gaussian_filter(np.asarray(rasterize(words(_SCENE_MM), grid)), (0, 1, 1))
+    volumes = {_TRUTH: truth} | results["views"] | {name: results[name] for name in reversed(solvers)}
+    write_volume(folder / "words.ome.tif", volumes[_BEST], grid)
+    scores = {"nothing (all zero)": quality(np.zeros_like(truth), truth)}
+    scores |= {name: quality(volume, truth) for name, volume in volumes.items() if name != _TRUTH}
+    with progress.step("Drawing"):
+        write_figure(folder / "words.png", _draw_words(results["image"], imager.sensor, volumes, scores, grid))
     context = {
         "distances": nearest_neighbour_distances(np.array(design.array.centers_mm)),
-        "findings": findings(design, sheet),
-        "targets": targets,
+        "findings": findings(design, results["sheet"]),
+        "targets": results["targets"],
         "scores": scores,
-        "points": score,
-        "mold": mold,
+        "points": results["points"][1],
+        "mold": results["mold"],
         "seconds": seconds,
     }
     write_text(folder / "report.md", page.render(context), [".md"])
     return folder / "report.md"
 
 
-def _optimise(folder: Path, progress: Progress) -> list[dict]:
+def _optimise(folder: Path, seconds: dict, progress: Progress) -> list[dict]:
     """Optimise the design as the paper prints it, out of focus, for the targets of the paper."""
     write_text(folder / "study.toml", template("example_study.toml").render(), [".toml"])
     printed = geomscope(sensor_distance_mm=4.0)
     write_design(folder / "printed.toml", printed)
-    outcome = run_study(printed, folder / "study.toml", progress=progress)
-    write_outcome(folder / "optimized.toml", outcome, parent="printed.toml", source="study.toml")
+    with _timed(seconds, "optimisation"):
+        outcome = run_study(printed, folder / "study.toml", progress=progress)
+        write_outcome(folder / "optimized.toml", outcome, parent="printed.toml", source="study.toml")
     return as_records(outcome)
 
 
@@ -121,46 +166,33 @@ def words(pitch: float) -> Float[np.ndarray, "emitter 4"]:
     return np.concatenate(parts)
 
 
-def _image_words(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[dict[str, Quality], dict]:
-    """Reconstruct words at three depths by several methods; return scores, and the contents of the page."""
-    imager = design.imager()
-    scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
-    planes = Grid.over(imager.sensor, depths=_WORD_DEPTHS, pitch=_WORD_VOXEL_MM)
-    grid = planes.at(planes.depths[_WORD_PLANES])
-    emitters = words(_SCENE_MM)
+def _image_words(folder: Path, imager: Imager, seconds: dict, progress: Progress) -> np.ndarray:
+    """Write and return a capture of words at three depths."""
+    grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
     with _timed(seconds, "simulating words"):
-        light = simulate(np.asarray(rasterize(emitters, scene_grid)), imager, scene_grid, progress=progress)
-        image = _expose(light, folder / "words.tif", seed=0)
-    # Blurred by a voxel, so that shifts by parts of a voxel are not counted as errors.
-    volumes = {_TRUTH: gaussian_filter(np.asarray(rasterize(emitters, grid)), (0, 1, 1))}
+        light = simulate(np.asarray(rasterize(words(_SCENE_MM), grid)), imager, grid, progress=progress)
+        return _expose(light, folder / "words.tif", seed=0)
+
+
+def _back_project(
+    imager: Imager, planes: Grid, seconds: dict, progress: Progress, image: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The planes of the words in the back-projection, as it is and after a network."""
     with _timed(seconds, "back-projection"):
         plain = reconstruct(image, imager, planes, progress=progress)
     with progress.step("Suppressing the background"), _timed(seconds, "U-Net"):
         clean = suppress(plain, pretrained())
-    volumes |= {"back-projection": plain[_WORD_PLANES], "back-projection + U-Net": clean[_WORD_PLANES]}
-    solvers = {
-        f"Richardson-Lucy, {_STEPS} steps": RichardsonLucy(_STEPS, accelerate=True),
-        f"ADMM, {_STEPS} steps": ADMM(_STEPS),
-        _BEST: Unrolled.pretrained(),
-    }
-    for name, solver in solvers.items():
-        with _timed(seconds, name):
-            volumes[name] = reconstruct(image, imager, grid, solver, progress=progress)
-    write_volume(folder / "words.ome.tif", volumes[_BEST], grid)
-    truth = volumes[_TRUTH]
-    scores = {"nothing (all zero)": quality(np.zeros_like(truth), truth)}
-    scores |= {name: quality(volume, truth) for name, volume in volumes.items() if name != _TRUTH}
-    with progress.step("Drawing"):
-        write_figure(folder / "words.png", _draw_words(image, imager.sensor, volumes, scores, grid))
-    return scores, {"image": image, "volume": volumes[_BEST], "grid": grid}
+    return {"back-projection": plain[_WORD_PLANES], "back-projection + U-Net": clean[_WORD_PLANES]}
 
 
-def _image_points(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[np.ndarray, Localization]:
-    imager = design.imager()
+def _image_points(folder: Path, imager: Imager, seconds: dict, progress: Progress) -> tuple[np.ndarray, Localization]:
+    """Write a capture of points and those that are found in it; return these and their score."""
     truth = random_points(_POINTS, (20.0, 20.0), (19.0, 21.0), seed=1)
     with _timed(seconds, "simulating points"):
         light = simulate(truth, imager, progress=progress)
         image = _expose(light, folder / "points.tif", seed=1)
+    del light
+    release_memory()
     with _timed(seconds, "finding points"):
         grid = Grid.over(imager.sensor, depths=_POINT_DEPTHS, pitch=_POINT_VOXEL_MM)
         found = find_points(image, imager, grid, progress=progress)
@@ -179,7 +211,7 @@ def _expose(light: np.ndarray, path: Path, seed: int) -> np.ndarray:
 
 @contextmanager
 def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
-    started = perf_counter()
+    seconds[step], started = 0.0, perf_counter()  # in the order in which they start
     yield
     seconds[step] = perf_counter() - started
 

@@ -1,6 +1,7 @@
 """Versions, devices and memory of this machine. Importing this module does not import JAX."""
 
 import contextlib
+import ctypes
 import math
 import os
 import platform
@@ -16,6 +17,8 @@ import psutil
 from .._version import __version__
 from .errors import input_error
 
+# Number of an option of glibc.
+_M_ARENA_MAX = -8
 # Seconds for which compiled programs are kept.
 _KEPT_FOR = 30 * 24 * 3600
 
@@ -123,6 +126,22 @@ def _processor() -> str:
 def available_memory() -> int:
     """Bytes that this process can take without swapping."""
     return psutil.virtual_memory().available
+
+
+def share_heaps() -> None:
+    """Let the threads that start from now on share two heaps: in one for each, more free memory is out of reach."""
+    _call_glibc("mallopt", _M_ARENA_MAX, 2)
+
+
+def release_memory() -> None:
+    """Give memory that is free within this process back to the system: compilers leave much of it, in small pieces."""
+    _call_glibc("malloc_trim", 0)
+
+
+def _call_glibc(name: str, *arguments: int) -> None:
+    if sys.platform == "linux":
+        with contextlib.suppress(AttributeError):  # another C library
+            getattr(ctypes.CDLL(None), name)(*arguments)
 
 
 def status_mib(key: str) -> float:
