@@ -32,7 +32,7 @@ _AHEAD = 2
 # Seconds: timeout of the scheduler, timeout of closing, and between two counts of the workers.
 _ANSWER, _END, _RECOUNT = 10, 2, 1.0
 # Seconds after which memory is released that jobs in threads have freed.
-_RELEASE = 0.5
+_RELEASE = 2.0
 _lock = threading.Lock()
 # The function that this worker calls, by token.
 _functions: dict[str, Callable[[Any], Any]] = {}
