@@ -49,7 +49,7 @@ _SCENE_MM = 0.0145
 # Voxels of the words. Networks see planes between and beyond theirs; each step of a solver costs a hundred
 # back-projections, so that solvers have the planes of the words.
 _WORD_DEPTHS, _WORD_PLANES, _WORD_VOXEL_MM = np.arange(17.0, 23.01, 0.5), slice(2, 11, 4), 0.11
-_STEPS, _LUCY_STEPS = 6, 12
+_STEPS, _LUCY_STEPS = 6, 16
 # Voxels in which points are found.
 _POINT_DEPTHS, _POINT_VOXEL_MM = np.arange(17.0, 23.01, 0.5), 0.0415
 _POINTS = 60
