@@ -149,8 +149,9 @@ def find_points(
         new = _search(detection._replace(light=own.rest), least, lens_types, voxels, progress)
         with progress.step("Comparing lenses"):
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
-    own = own._replace(rest=own.rest[:0])  # as large as the capture
-    fit = fit_points(points, view_quantile(own.light, samples.seen, 0.5), detection, lens_types)
+    brightness = view_quantile(own.light, samples.seen, 0.5)
+    del own  # It has an image as large as the capture.
+    fit = fit_points(points, brightness, detection, lens_types)
     points = np.column_stack([fit.positions, fit.intensities])
     points = points[_inside(points, grid, _step(voxels) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]
