@@ -3,7 +3,8 @@
 Beads, letters with bars, tilted sheets and texture are those of `design_judge`; blobs are 24 Gaussian ones of 0.12 to
 0.35 mm and two vessels. All lie within 10 mm by 10 mm by 3.6 mm before the paper's lenses and are ray-traced through
 all of them onto the whole sensor. "dB" is above an empty volume, for a truth that is blurred by a voxel, and in
-brackets after the same blur of the volume. Seconds are of one call, without tables and compilation.
+brackets after the same blur of the volume. Seconds are those of all processors in one call, without tables and
+compilation.
 
     python -m experiments.front [--kinds blobs,texture] [--exposures 10000,300] [--draws 3] [--out DIR]
 
@@ -76,9 +77,9 @@ def run(kinds: list[str], exposures: list[int], draws: int, progress: gs.Progres
                 if name not in compiled:
                     compiled.add(name)
                     invert(np.asarray(counts))
-                start = time.perf_counter()
+                start = time.process_time()
                 volume = invert(np.asarray(counts))
-                seconds = time.perf_counter() - start
+                seconds = time.process_time() - start
                 row = {"kind": kind, "exposure": exposure, "draw": draw, "method": name, "steps": steps}
                 rows.append(
                     row | {"s": seconds, "db": _gain(volume, truth), "blurred_db": _gain(_blurred(volume), truth)}
@@ -106,7 +107,7 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
                 [np.mean([row[key] for row in some if row["steps"] == n]) for n in STEPS[name]] for key in ("s", "db")
             ]
             axes.plot(*means, "o-", label=name)
-        axes.set(title=kind, xlabel="time, s", xscale="log")
+        axes.set(title=kind, xlabel="processor time, s", xscale="log")
     figure.axes[0].set_ylabel("dB above an empty volume")
     figure.axes[0].legend(fontsize=7)
     return figure
@@ -125,7 +126,7 @@ def report(kinds: list[str], exposures: list[int], draws: int, progress: gs.Prog
             spread = f" ± {np.std(db, ddof=1) / len(db) ** 0.5:.1f}" if len(db) > 1 else ""
             cells.append(f"{np.mean(db):.1f}{spread} ({np.mean(blurred_db):.1f})")
         lines.append([name, str(steps), f"{np.median([row['s'] for row in of_method]):.0f}", *cells])
-    columns = ("method", "steps", "s", *(f"{kind}, {exposure}" for kind, exposure in keys))
+    columns = ("method", "steps", "processor s", *(f"{kind}, {exposure}" for kind, exposure in keys))
     files, shown = tables_report("front", rows, (columns, lines))
     return Report(files | {"front.png": picture(rows)}, shown)
 
