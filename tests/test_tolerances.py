@@ -48,7 +48,8 @@ both_strehls = jax.jit(
 
 @eqx.filter_jit
 def sampled(seed, lenses: int, spec: ToleranceSpec) -> device_model.Errors:
-    return device_model.sample_errors(jax.random.key(seed), lenses, device_model.standard_deviations(spec))
+    keys, deviations = jax.random.key(seed)[None], device_model.standard_deviations(spec)
+    return jax.tree.map(lambda error: error[0], device_model.sample_errors(keys, lenses, deviations))
 
 
 DEPTHS = (18.0, 20.0, 23.0)

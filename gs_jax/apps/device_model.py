@@ -14,6 +14,7 @@ at known positions. There is no noise: what is left is the device's error.
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -59,8 +60,8 @@ ERROR_FIELDS = {
     "roughness": "roughness",
     "printed layers": "layer",
 }
-# The tolerances that are the same for every device.
-CONSTANT = ("roughness", "printed layers")
+# The tolerances that are the same for every device and change no depth, and the one that changes no image.
+CONSTANT, POSITION = ("roughness", "printed layers"), "position"
 # Rings of equal area in a lens: terraces are wide in its middle only.
 _RINGS = 256
 # A single lens gives no depth. Lists of lenses are filled up to a multiple of so many.
@@ -113,13 +114,18 @@ def no_errors(lenses: int) -> Errors:
     return Errors(jnp.zeros((lenses, 2)), zero, zero, zero, zero, jnp.zeros(2), zero, zero)
 
 
-def sample_errors(key: Key[Array, ""], lenses: int, deviations: Errors) -> Errors:
-    """Sample the errors of a device."""
+@partial(jax.jit, static_argnames="lenses")
+def sample_errors(keys: Key[Array, " device"], lenses: int, deviations: Errors) -> Errors:
+    """Sample the errors of devices, each with a key."""
     flat, tree = jax.tree.flatten(no_errors(lenses))
-    keys = jax.random.split(key, len(flat))
-    normal = jax.tree.unflatten(tree, [jax.random.normal(k, part.shape) for k, part in zip(keys, flat, strict=True)])
-    normal = dataclasses.replace(normal, **{ERROR_FIELDS[name]: jnp.ones(()) for name in CONSTANT})
-    return jax.tree.map(jnp.multiply, normal, deviations)
+
+    def sample(key):
+        parts = zip(jax.random.split(key, len(flat)), flat, strict=True)
+        normal = jax.tree.unflatten(tree, [jax.random.normal(own, part.shape) for own, part in parts])
+        normal = dataclasses.replace(normal, **{ERROR_FIELDS[name]: jnp.ones(()) for name in CONSTANT})
+        return jax.tree.map(jnp.multiply, normal, deviations)
+
+    return jax.vmap(sample)(keys)
 
 
 def without_tolerance(deviations: Errors, name: str) -> Errors:
@@ -282,17 +288,25 @@ def _visible(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> VisibleP
 
 
 def depth_errors(
-    imager: Imager, cores: CoreModel, sources: VisiblePoints, points: VisiblePoints, errors: Errors
+    imager: Imager,
+    cores: CoreModel,
+    sources: VisiblePoints,
+    points: VisiblePoints,
+    errors: Errors,
+    *,
+    steps: int = _ITERATIONS,
 ) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
     """Depth errors of points seen by a device, mm: with the geometry of the design, and with a calibrated one.
 
-    The imager is the design's, with a `tilt`; the device is calibrated by the sources.
+    The imager is the design's, with a `tilt`; the device is calibrated by the sources. Without errors no residual is
+    left, and the first of the Gauss-Newton steps has the derivatives of all.
     """
     device = perturb(imager, errors)
     change = jnp.tensordot(jnp.stack([errors.radius, errors.conic, errors.index]), cores.slopes, 1)
     offsets = cores.offsets._replace(offset=cores.offsets.offset + change)
     photographed = _photograph(device, offsets, sources, imager, cores.offsets)
-    fitted = _least_squares(lambda unknowns: residuals(unknowns, photographed), initial_unknowns(FITTED, photographed))
+    start = initial_unknowns(FITTED, photographed)
+    fitted = _least_squares(lambda unknowns: residuals(unknowns, photographed), start, steps)
     assumed = jax.tree.map(lambda *two: jnp.stack(two), imager, apply_to_imager(fitted, imager))
 
     def error(assumed, point):
@@ -300,7 +314,7 @@ def depth_errors(
         spots = _photograph(device, offsets, one, assumed, cores.offsets)
         spots = spots._replace(unknown=jnp.array([[0, 0], [0, 1], [0, 2]]))
         start = Unknowns(coordinates=point.points)
-        located = _least_squares(lambda unknowns: residuals(unknowns, spots), start)
+        located = _least_squares(lambda unknowns: residuals(unknowns, spots), start, steps)
         assert located.coordinates is not None
         return located.coordinates[2] - point.points[2]
 
@@ -321,7 +335,7 @@ def _photograph(
     return spots._replace(positions=places, imager=assumed, offsets=known)
 
 
-def _least_squares(residual: Callable[[Unknowns], Array], start: Unknowns) -> Unknowns:
+def _least_squares(residual: Callable[[Unknowns], Array], start: Unknowns, steps: int) -> Unknowns:
     """Minimise a sum of squares by Gauss-Newton steps."""
     state, unravel = ravel_pytree(start)
     flat = lambda state: residual(unravel(state)).ravel()
@@ -333,7 +347,7 @@ def _least_squares(residual: Callable[[Unknowns], Array], start: Unknowns) -> Un
         q, r = jnp.linalg.qr(slopes * scale[None])
         return state - scale * solve_triangular(r, q.T @ flat(state))
 
-    return unravel(jax.lax.fori_loop(0, _ITERATIONS, step, state))
+    return unravel(jax.lax.fori_loop(0, steps, step, state))
 
 
 class Measures(NamedTuple):
@@ -373,23 +387,41 @@ def make_problem(
     return Problem(parts, depth_arguments(design.imager(), depths, sources), jnp.asarray(pixel))
 
 
-def measure_devices(problem: Problem, errors: Errors, advance=lambda: None) -> Measures:
-    """Measure devices, in batches of one size for any number of them, so that one program is compiled."""
-    batches, count = [], len(errors.radius)
-    for start in range(0, count, BATCH):
+def measure_devices(problem: Problem, errors: Errors, advance: Callable[[], None] = lambda: None) -> Measures:
+    """Measure devices; `advance` is called after each half of a batch."""
+    functions = sharpness_of_devices, depth_errors_of_devices
+    return Measures(*(values for one in functions for values in measure(one, problem, errors, advance)))
+
+
+def measure(
+    function: Callable[[Problem, Errors], tuple[Array, Array]],
+    problem: Problem,
+    errors: Errors,
+    advance: Callable[[], None] = lambda: None,
+) -> tuple[np.ndarray, ...]:
+    """Half of the measures of devices, in batches of one size for any number of them, so that one program is compiled.
+
+    `function` is one of the next two.
+    """
+    batches, errors = [], jax.device_get(errors)
+    for start in range(0, count := len(errors.radius), BATCH):
         index = np.minimum(np.arange(start, start + BATCH), count - 1)
-        batch = _measure(problem, jax.tree.map(lambda error, index=index: error[index], errors))
-        batches.append(Measures(*(np.asarray(values, np.float64)[: count - start] for values in batch)))
+        batch = function(problem, jax.tree.map(lambda error, index=index: error[index], errors))
+        batches.append([np.asarray(values, np.float64)[: count - start] for values in batch])
         advance()
-    return Measures(*map(np.concatenate, zip(*batches, strict=True)))
+    return tuple(map(np.concatenate, zip(*batches, strict=True)))
 
 
 @eqx.filter_jit
-def _measure(problem: Problem, errors: Errors) -> Measures:
-    def measure(device: Errors) -> Measures:
-        return Measures(*sharpness(problem, device), *depth_errors(*problem.depth_arguments, device))
+def sharpness_of_devices(problem: Problem, errors: Errors) -> tuple[Array, Array]:
+    """`sharpness` of a batch of devices."""
+    return jax.vmap(lambda device: sharpness(problem, device))(errors)
 
-    return jax.vmap(measure)(errors)
+
+@eqx.filter_jit
+def depth_errors_of_devices(problem: Problem, errors: Errors) -> tuple[Array, Array]:
+    """`depth_errors` of a batch of devices."""
+    return jax.vmap(lambda device: depth_errors(*problem.depth_arguments, device))(errors)
 
 
 def sharpness(problem: Problem, errors: Errors) -> tuple[Float[Array, " depth"], Float[Array, " depth"]]:

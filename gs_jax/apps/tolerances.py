@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from rich.table import Table
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.workers import compile_at_once
 from ..design.datasheets import text_table
 from ..design.design import Design
 from ..microscope.geometry import Imager, check_beyond
@@ -24,15 +26,19 @@ from .device_model import (
     BATCH,
     CONSTANT,
     ERROR_FIELDS,
+    POSITION,
     Errors,
     Measures,
     Problem,
     depth_errors,
+    depth_errors_of_devices,
     make_problem,
+    measure,
     measure_devices,
     no_errors,
     sample_errors,
     sharpness,
+    sharpness_of_devices,
     standard_deviations,
     without_tolerance,
 )
@@ -145,51 +151,65 @@ def tolerance(
     with progress.step("Tracing cores"):
         problem = make_problem(design, z, sources, tolerances.pixel_um / 1000)
     deviations = standard_deviations(tolerances)
+    perfect = no_errors(problem.lenses)
+    batch = jax.tree.map(lambda error: np.stack([error] * BATCH), jax.device_get(perfect))
+    with progress.step("Compiling"):
+        calls = [(one, (problem, perfect)) for one in (_slopes_of_sharpness, _slopes_of_depths)]
+        compile_at_once(*calls, *((one, (problem, batch)) for one in (sharpness_of_devices, depth_errors_of_devices)))
     with progress.step("Gradients"):
-        alone = _changes_by_gradient(problem, deviations)
+        slopes = jax.device_get([*_slopes_of_sharpness(problem, perfect), *_slopes_of_depths(problem, perfect)])
     with progress.step("Nominal"):
         nominal, constant = _nominal_and_constant(problem, deviations)
+    alone = {name: Measures(*(_change(one, field, deviations) for one in slopes)) for name, field in _RANDOM.items()}
     limits = _make_limits(problem.parts, nominal, max_width, min_strehl, max_depth_error)
     names = [name for name, field in ERROR_FIELDS.items() if float(getattr(deviations, field)) > 0]
-    keys = jax.random.split(jax.random.key(seed), draws)
-    devices, met = [], []
-    with progress.counter("Devices", (1 + len(names)) * -(-draws // BATCH)) as advance:
-        for spread in (deviations, *(without_tolerance(deviations, name) for name in names)):
-            errors = jax.vmap(lambda key, spread=spread: sample_errors(key, problem.lenses, spread))(keys)
-            devices.append(measure_devices(problem, errors, advance))
-            met.append(_find_met(limits, devices[-1]))
+    keys, sample = jax.random.split(jax.random.key(seed), draws), partial(sample_errors, lenses=problem.lenses)
+    # What a tolerance does not change is as with all of them.
+    same = [name for name in names if name in (POSITION, *CONSTANT)]
+    with progress.counter("Devices", (2 + 2 * len(names) - len(same)) * -(-draws // BATCH)) as advance:
+        devices = measure_devices(problem, sample(keys, deviations=deviations), advance)
+        met = [_find_met(limits, devices)]
+        for name in names:
+            errors = sample(keys, deviations=without_tolerance(deviations, name))
+            sharp, deep = devices[:2], devices[2:]
+            if name != POSITION:
+                sharp = measure(sharpness_of_devices, problem, errors, advance)
+            if name not in CONSTANT:
+                deep = measure(depth_errors_of_devices, problem, errors, advance)
+            met.append(_find_met(limits, Measures(*sharp, *deep)))
     yields = [float(np.all(list(by_target.values()), axis=0).mean()) for by_target in met]
     without = dict(zip(names, yields[1:], strict=True))
     points = np.asarray(problem.depth_arguments[3].points, np.float64)
-    return Outcome(design.name, tolerances, z, points, limits, nominal, devices[0], alone | constant, met[0], without)
+    return Outcome(design.name, tolerances, z, points, limits, nominal, devices, alone | constant, met[0], without)
+
+
+# Fields of `Errors` that are random.
+_RANDOM = {name: field for name, field in ERROR_FIELDS.items() if name not in CONSTANT}
 
 
 @eqx.filter_jit
-def _derivatives(problem: Problem, perfect: Errors) -> tuple[dict[str, Array], ...]:
-    """The derivatives of each measure by fields of `Errors`; lens positions do not change sharpness."""
-    fields = {field: getattr(perfect, field) for name, field in ERROR_FIELDS.items() if name not in CONSTANT}
-    shapes = {field: value for field, value in fields.items() if field != "centers"}
-
-    def sharpness_of(values):
-        return sharpness(problem, dataclasses.replace(perfect, **values))
-
-    def errors_of_depth(values):
-        return depth_errors(*problem.depth_arguments, dataclasses.replace(perfect, **values))
-
-    return *jax.jacfwd(sharpness_of)(shapes), *jax.jacfwd(errors_of_depth)(fields)
+def _slopes_of_sharpness(problem: Problem, perfect: Errors) -> tuple[dict[str, Array], ...]:
+    """Derivatives of `sharpness` by fields of `Errors`; lens positions do not change it."""
+    fields = {field: getattr(perfect, field) for name, field in _RANDOM.items() if name != POSITION}
+    return jax.jacfwd(lambda values: sharpness(problem, dataclasses.replace(perfect, **values)))(fields)
 
 
-def _changes_by_gradient(problem: Problem, deviations: Errors) -> dict[str, Measures]:
-    """The RMS change of each measure by each random tolerance."""
-    slopes = jax.device_get(_derivatives(problem, no_errors(problem.lenses)))
+@eqx.filter_jit
+def _slopes_of_depths(problem: Problem, perfect: Errors) -> tuple[dict[str, Array], ...]:
+    """Derivatives of `depth_errors` by fields of `Errors`."""
+    fields = {field: getattr(perfect, field) for field in _RANDOM.values()}
 
-    def change(slopes: dict[str, np.ndarray], field: str) -> Float64[np.ndarray, "..."]:
-        shape = slopes["radius"].shape
-        slope = np.asarray(slopes.get(field, np.zeros(shape)), np.float64).reshape(*shape, -1)
-        return float(getattr(deviations, field)) * np.sqrt((slope**2).sum(-1))
+    def errors(values):
+        return depth_errors(*problem.depth_arguments, dataclasses.replace(perfect, **values), steps=1)
 
-    random = {name: field for name, field in ERROR_FIELDS.items() if name not in CONSTANT}
-    return {name: Measures(*(change(of_measure, field) for of_measure in slopes)) for name, field in random.items()}
+    return jax.jacfwd(errors)(fields)
+
+
+def _change(slopes: dict[str, np.ndarray], field: str, deviations: Errors) -> Float64[np.ndarray, "..."]:
+    """The RMS change of a measure by the deviation of a field."""
+    shape = slopes["radius"].shape
+    slope = np.asarray(slopes.get(field, np.zeros(shape)), np.float64).reshape(*shape, -1)
+    return float(getattr(deviations, field)) * np.sqrt((slope**2).sum(-1))
 
 
 def _nominal_and_constant(problem: Problem, deviations: Errors) -> tuple[Measures, dict[str, Measures]]:

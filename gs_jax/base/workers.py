@@ -72,6 +72,15 @@ def run_jobs(jobs: Mapping[str, tuple[Any, ...]], count: int = 2) -> dict[str, A
     return results
 
 
+def compile_at_once(*calls: tuple[Any, tuple]) -> None:
+    """Compile jitted functions for arguments, in threads, before they are called: XLA releases Python's lock.
+
+    They are not to be called in threads: programs that run at once may wait for each other for ever on two cores.
+    """
+    for _ in map_in_threads(lambda call: call[0].lower(*call[1]).compile(), calls):
+        pass
+
+
 class _Work(NamedTuple):
     """Settings of a worker, and the pickled `build`, which is read once they are set."""
 
