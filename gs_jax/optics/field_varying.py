@@ -214,7 +214,7 @@ _FILTER_ORDER = 8
 # light. Its change with the clear area counts as for lenses that differ by this part or more.
 _LEFT_OUT, _WHOLE, _LEAST_SPREAD = 0.005, 4, 0.1
 # Rays of each field, and samples of a core.
-_RAYS, _CORE_SAMPLES = 16384, 2048
+_RAYS, _CORE_SAMPLES = 8192, 2048
 
 
 class StrayLight(eqx.Module):
@@ -411,11 +411,10 @@ def stray_light_table(
     fields = grid.step * grid.nodes(grid.fields)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS), aperture)
     chief = float(imager.magnification(float(depth)))
-    table = np.zeros((2, grid.fields, grid.radii * grid.angles))
-    binned = lambda landing, light: np.stack([_bin_polar(grid, *one) for one in zip(landing, light, strict=True)])
-    table[0] = binned(rays.landing, rays.light)
-    if aperture.by_area.any():
-        table[1] = binned(rays.landing, rays.light_per_area)
+    table, orders = np.zeros((2, grid.fields, grid.radii * grid.angles)), 1 + int(aperture.by_area.any())
+    for number, landing in enumerate(rays.landing):
+        lights = (rays.light[number], rays.light_per_area[number])[:orders]
+        table[:orders, number] = _bin_polar(grid, landing, *lights)
     for (inner, outer), distortion, light, profile, harmonics in zip(ring_edges(imager, ends), *cores, strict=True):
         amount = ring_light(fields**2, light, inner, outer)
         core = sample_profile(profile, _CORE_SAMPLES)
@@ -425,7 +424,7 @@ def stray_light_table(
             part = np.ones(len(core))
             for order, (along, _) in zip(HARMONICS, shares, strict=False):
                 part += (fields[number] / outer) ** order * along
-            table[0, number] -= _bin_polar(grid, landing, amount[number] / len(core) * part)
+            table[0, number] -= _bin_polar(grid, landing, amount[number] / len(core) * part)[0]
     around = table.reshape(2, grid.fields, grid.radii, grid.angles)
     # Spots are symmetric about the field's direction: their spectra are real. Near the axis nodes are closer together
     # than pixels, so that high harmonics would alias.
@@ -449,8 +448,8 @@ def stray_light_table(
     return (table * kept[..., None]).transpose(0, 3, 1, 2, 4).astype(np.float32)
 
 
-def _bin_polar(grid, landing, light):
-    """Light of rays on the polar nodes, `(radius angle)`."""
+def _bin_polar(grid, landing, *lights):
+    """Each of several lights of rays on the polar nodes, `(radius angle)`."""
     x, y = -landing.T / grid.pixel
     ray, node, share = polar_weights(grid, grid.radii, x, y)
-    return np.bincount(node, light[ray] * share, grid.radii * grid.angles)
+    return [np.bincount(node, light[ray] * share, grid.radii * grid.angles) for light in lights]

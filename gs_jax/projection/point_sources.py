@@ -38,7 +38,7 @@ _POINTS, _SPOTS = 2048, 32768
 # Side, in pixels, of the tiles in which the image is summed; they stay in the CPU's cache.
 _TILE = 512
 # Distance of the reduced depths of stray light, mm; cores are computed half-way, too.
-_STEP = 0.5
+_STEP = 0.7
 # Edges of the rings with a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
 _RINGS = tuple(np.arange(1, 29) / 8)
 
@@ -235,9 +235,9 @@ def full_image_of_points(
 ) -> Float[np.ndarray, "row column"]:
     """The image of points with the field-varying PSF, as `forward` computes it for voxels.
 
-    Cores are stamps in narrow rings of the field, interpolated between reduced depths that are 0.25 mm apart; stray
-    light is interpolated between some that are 0.5 mm apart. Nearer depths do not change the image of 120 ray-traced
-    points.
+    Cores are stamps in narrow rings of the field, interpolated between reduced depths that are 0.35 mm apart; stray
+    light is interpolated between some that are 0.7 mm apart. Nearer depths change the image of 120 ray-traced points by
+    less than 0.05 dB.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def _trace(points, imager: Imager, progress: Progress | None) -> _FullOptics:
     level, height = imager.level()
     lower = fine - float(height)
     grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    sharp = has_sharp_cores(level, lower, grid)
+    sharp = has_sharp_cores(level, lower[::every], grid)
     tables = trace_cores(level, lower, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
     stray_light = trace_stray_light(level, lower[::every], grid, cores, _RINGS, progress)
