@@ -8,7 +8,7 @@ import uuid
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -50,6 +50,12 @@ def cached_on_disk(key: Iterable[bytes], compute: Callable[[], dict[str, np.ndar
     with contextlib.suppress(*_NO_CACHE):
         _write(path, arrays)
     return arrays
+
+
+def key_of(tree: Any) -> list[bytes]:
+    """The structure and the numbers of a pytree, for a key."""
+    leaves, structure = jax.tree.flatten(tree)
+    return [repr(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)]
 
 
 def digest_of(key: Iterable[bytes]) -> str:

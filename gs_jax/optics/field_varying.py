@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, Int, Num
 
-from ..base.caches import cache_by_value, cached_on_disk
+from ..base.caches import cache_by_value, cached_on_disk, key_of
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..base.workers import map_in_threads
@@ -236,6 +236,10 @@ class StrayLight(eqx.Module):
         """Stray light on these nodes."""
         return cls(table, area, sensor_distance, to_polar_table(grid), to_pixels_table(grid), grid)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arguments of `on` besides the nodes, for a file."""
+        return {name: np.asarray(getattr(self, name)) for name in ("table", "area", "sensor_distance")}
+
 
 class FieldVaryingPsf(eqx.Module):
     """Where all of a point's light goes, at some depths; made by `field_varying_psf`.
@@ -313,8 +317,7 @@ def field_varying_psf(
 @cache_by_value(maxsize=4)
 def _tables(imager: Imager, depths, grid: PolarGrid, rings, *, progress: Progress | None) -> FieldVaryingPsf:
     """The tables of a level imager, of this process or from the disk."""
-    leaves, structure = jax.tree.flatten((imager, depths, grid, rings))
-    key = repr(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)
+    key = key_of((imager, depths, grid, rings))
     arrays = cached_on_disk(key, lambda: _trace_tables(imager, depths, grid, rings, progress))
     rings = tuple(arrays.pop("rings").tolist())
     dtype = imager.sensor_distance.dtype
@@ -344,7 +347,7 @@ def _trace_tables(imager: Imager, depths, grid: PolarGrid, given, progress) -> d
     arrays["wide_kernels"] = _kernels(cores, slice(inner, None), small, 0.5, large)
     arrays["harmonics"] = _harmonics(cores, slice(oriented, inner), size, 1, _SHARED)
     arrays["wide_harmonics"] = _harmonics(cores, slice(max(oriented, inner), None), small, 0.5, large)
-    return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
+    return arrays | stray_light.arrays()
 
 
 def has_sharp_cores(imager: Imager, depths: Float64[np.ndarray, " depth"], grid: PolarGrid) -> bool:

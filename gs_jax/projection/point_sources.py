@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.spatial import KDTree
 
+from ..base.caches import cached_on_disk, key_of
 from ..base.machine import cpu_device
 from ..base.progress import Progress
 from ..base.typing import Points
@@ -279,11 +280,18 @@ def _trace(points, imager: Imager, progress: Progress | None) -> _FullOptics:
     level, height = imager.level()
     lower = fine - float(height)
     grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    sharp = has_sharp_cores(level, lower[::every], grid)
-    tables = trace_cores(level, lower, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
-    coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
-    stray_light = trace_stray_light(level, lower[::every], grid, cores, _RINGS, progress)
-    return _FullOptics(coarse, stray_light, _stamps_of_rings(imager, fine, tables, kernel_size(imager, grid)))
+
+    def trace() -> dict[str, np.ndarray]:
+        sharp = has_sharp_cores(level, lower[::every], grid)
+        tables = trace_cores(level, lower, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
+        cores = PsfCores(*(part[::every] for part in tables))
+        return tables._asdict() | trace_stray_light(level, lower[::every], grid, cores, _RINGS, progress).arrays()
+
+    # The next image of these points by this microscope finds the tables on the disk.
+    arrays = cached_on_disk([b"points", *key_of((level, lower, grid, _RINGS))], trace)
+    tables = PsfCores(*(arrays.pop(name) for name in PsfCores._fields))
+    stray_light = StrayLight.on(grid, **{name: jax.device_put(part) for name, part in arrays.items()})
+    return _FullOptics(fine[::every], stray_light, _stamps_of_rings(imager, fine, tables, kernel_size(imager, grid)))
 
 
 def _stamps_of_rings(imager: Imager, depths, tables: PsfCores, size: int) -> Iterator[Stamps]:
