@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import jax
@@ -120,8 +120,13 @@ def _run_eagerly(*arrays, call):
 
 @_linear.def_abstract_eval
 def _shapes(*arrays, call):
-    shapes = jax.eval_shape(call, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
-    return [ShapedArray(s.shape, s.dtype) for s in shapes]
+    return _shapes_of(call, *(ShapedArray(a.shape, a.dtype) for a in arrays))
+
+
+# Lowering asks for them again.
+@lru_cache(maxsize=256)
+def _shapes_of(call, *arrays):
+    return [ShapedArray(s.shape, s.dtype) for s in jax.eval_shape(call, *arrays)]
 
 
 def _jvp(primals, tangents, *, call):
@@ -195,7 +200,7 @@ def _run_on(platform, *arrays, call):
     if load is None:
         return call(*arrays)
     _, x = call.split(arrays)
-    single = {y.dtype for y in jax.eval_shape(call, *arrays)} == {jnp.dtype(jnp.float32)}
+    single = {y.dtype for y in _shapes(*arrays, call=call)} == {jnp.dtype(jnp.float32)}
     # Of images; the rows of other arrays are long enough.
     columns = getattr(call.static, "image", (0, _LEAST_COLUMNS))[1]
     suitable = single and all(a.dtype != jnp.float64 for a in x) and columns >= _LEAST_COLUMNS

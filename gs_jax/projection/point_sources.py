@@ -17,6 +17,7 @@ from ..base.machine import cpu_device
 from ..base.progress import Progress
 from ..base.typing import Points
 from ..base.workers import map_in_threads
+from ..linear.linear_map import compiled_for_cpu
 from ..microscope.geometry import FALLOFF, Imager
 from ..microscope.media import object_index
 from ..optics.field_varying import (
@@ -313,7 +314,9 @@ def _full_image(points, imager: Imager, optics: _FullOptics, progress: Progress 
     stray_light = optics.stray_light
     nodes = jnp.asarray(_to_nodes(points, optics.depths, stray_light.grid), imager.sensor_distance.dtype)
     planes = jnp.asarray(optics.depths, nodes.dtype)
-    image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))
+    # Kernels would take longer to compile than they save.
+    with compiled_for_cpu("xla"):
+        image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))
     image += forward_points(points, imager, optics.stamps, progress)
     # The stray light ripples below zero in places; clipping adds light, which scaling removes.
     clipped = np.maximum(image, 0)
