@@ -41,7 +41,7 @@ _STEPS, _FACTOR, _FARTHEST_SHIFT, _TABLE_ERROR, _FARTHEST_MOVE = 2, 3.0, 3.0, 0.
 # Robust weights: Cauchy's, at this multiple of the spread; and how often they are renewed.
 _CAUCHY, _RENEWALS = 2.0, 8
 # Fewest views of a fit, and views that are fitted at once.
-_MIN_VIEWS, _AT_ONCE = 3, 4096
+_MIN_VIEWS, _AT_ONCE = 3, 1024
 # Movement of a point for derivatives, mm.
 _MOVE = 1e-3
 # Against divisions by zero.
@@ -214,21 +214,29 @@ def _find_views(points, lens_type: LensType, tables: SpotTables, shape: tuple[in
     along = axes[:, 0, :1] * right + axes[:, 0, 1:] * down - middle[:, None]
     across = axes[:, 1, :1] * right + axes[:, 1, 1:] * down
     spot = np.empty((3, *row.shape), np.float32)
-    for first in range(0, len(point), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+
+    def fill(some: slice) -> None:
         spot[:, some] = tables.spots_at(depth[some], field[some], along[some], across[some])
+
+    list(map_in_threads(fill, _parts(len(point))))
     return _Views(point, field <= float(imager.field_radius), slope, (row, column), spot)
 
 
 def _fit_views(rest, views: _Views, intensities):
     """Light, shift along and across the field, and its variance, of each view by linear least squares."""
-    fits = []
-    for first in range(0, max(len(views.point), 1), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+
+    def fit(some: slice) -> tuple[np.ndarray, ...]:
         expected = intensities[views.point[some], None] * views.spot[0, some]
         data = rest[tuple(part[some] for part in views.pixels)] + expected
-        fits.append(_least_squares(data, *views.spot[:, some].astype(np.float64)))
-    return views.point, views.is_inner, views.slope, *map(np.concatenate, zip(*fits, strict=True))
+        return _least_squares(data, *views.spot[:, some].astype(np.float64))
+
+    fits = zip(*map_in_threads(fit, _parts(len(views.point))), strict=True)
+    return views.point, views.is_inner, views.slope, *map(np.concatenate, fits)
+
+
+def _parts(count: int) -> list[slice]:
+    """Views that are computed at once, a part at least."""
+    return [slice(first, first + _AT_ONCE) for first in range(0, max(count, 1), _AT_ONCE)]
 
 
 def _least_squares(data, shape, d_along, d_across):

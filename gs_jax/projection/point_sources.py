@@ -35,8 +35,9 @@ from .stray_light import stray_light_image
 
 # Positions of a stamp within a pixel, along each axis: the error is at most a tenth of a pixel.
 STEPS = 5
-# Points and spots computed at once, which bounds the memory (the built-in design has 13 spots per point).
-_POINTS, _SPOTS = 2048, 32768
+# Points and spots computed at once, which bounds the memory (the built-in design has 13 spots per point); spots of few
+# points.
+_POINTS, _SPOTS, _FEW_POINTS, _FEW_SPOTS = 2048, 32768, 256, 2048
 # Side, in pixels, of the tiles in which the image is summed; they stay in the CPU's cache.
 _TILE = 512
 # Distance of the reduced depths of stray light, mm; cores are computed half-way, too.
@@ -143,6 +144,7 @@ def _add_points(tiles: Array | None, points: Points, imager: Imager, stamps: Sta
         rows, columns = _tiles(imager.sensor.shape, size)
         tiles = jax.device_put(np.zeros((rows * columns, *2 * (_TILE + size - 1,)), kernels.dtype), device)
     lenses, starts = KDTree(host.centers), range(0, len(points), _POINTS)
+    most = _FEW_SPOTS if len(points) <= _FEW_POINTS else _SPOTS
     for start in progress.track(starts, "Imaging points"):
         batch = points[start : start + _POINTS]
         lateral = batch[:, :2] - host.axis_offset(batch[:, 2])
@@ -150,10 +152,10 @@ def _add_points(tiles: Array | None, points: Points, imager: Imager, stamps: Sta
         if stamps.ring:
             # Those in the ring's hole have no light.
             pairs = pairs[pairs["v"] >= stamps.ring.edges[0] * (1 - FALLOFF)]
-        for first in range(0, len(pairs), _SPOTS):
+        for first in range(0, len(pairs), most):
             # Always as many, so that one shape is compiled; repetitions at the end are not added.
-            spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
-            count = min(_SPOTS, len(pairs) - first)
+            count = min(most, len(pairs) - first)
+            spots = pairs[first + np.arange(most) % count]
             core = _core(batch[:, 2], imager, stamps)
             spot_arguments = (batch[spots["i"]], spots["j"], *(part[spots["i"]] for part in core))
             tiles = _add_spots(tiles, count, *spot_arguments, imager, depths, kernels, weight)
