@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
+from threading import Thread
 
 import equinox as eqx
 import jax
@@ -25,6 +26,7 @@ from .base.errors import InputError, input_error, short_repr
 from .base.machine import available_memory
 from .base.progress import Progress
 from .base.typing import Number, PathLike
+from .base.workers import compile_at_once
 from .io.point_tables import read_scene_points
 from .io.volumes import read_volume
 from .microscope.geometry import Imager, check_beyond
@@ -428,6 +430,14 @@ def expose(
         if wrong := np.count_nonzero(~((light >= 0) & (light < math.inf))):
             raise ValueError(f"`image` must be finite and not negative, got {wrong} pixels that are not.")
     return _expose(image, camera, key, peak_electrons)
+
+
+def compile_exposure(shape: tuple[int, int], camera: Camera, seed: int, peak_electrons: float) -> Thread:
+    """Compile `expose` for images of a shape, float32, in a thread while they are computed; join it before."""
+    call = _expose, (jax.ShapeDtypeStruct(shape, jnp.float32), camera, jax.random.key(seed), peak_electrons)
+    thread = Thread(target=compile_at_once, args=[call], daemon=True)
+    thread.start()
+    return thread
 
 
 @jax.jit

@@ -220,7 +220,7 @@ def simulate_command(
 
     from ..design.design import read_design
     from ..io.captures import CAPTURE_SUFFIXES, write_capture
-    from ..simulation import Camera, expose, read_scene, simulate
+    from ..simulation import Camera, compile_exposure, expose, read_scene, simulate
 
     check_outputs(output, CAPTURE_SUFFIXES, inputs=(scene, design))
     if not noise and output.suffix.lower() == ".png":
@@ -234,12 +234,14 @@ def simulate_command(
     microscope = read_design(design)
     with Progress() as progress:
         imager = light.imager(microscope)
+        camera = Camera(gain, offset, read_noise, math.inf if full_well is None else full_well, bits)
         with errors_name_file(scene):
             objects, grid = _placed(scene, *read_scene(scene), light, imager)
+            compiling = compile_exposure(imager.sensor.shape, camera, seed, peak_electrons) if noise else None
             image = simulate(objects, imager, grid, optics=optics, psf=psf, progress=progress)
-        if noise:
+        if compiling:
             with progress.step("Exposing"):
-                camera = Camera(gain, offset, read_noise, math.inf if full_well is None else full_well, bits)
+                compiling.join()
                 image = np.asarray(expose(image, camera, jax.random.key(seed), peak_electrons=peak_electrons))
         with progress.step("Writing"):
             write_capture(output, image, provenance_of(scene, design=microscope))
