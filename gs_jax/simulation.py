@@ -326,8 +326,8 @@ def simulate_points(
         return np.zeros(imager.sensor.shape, np.float32)
     if kind == "full":
         return full_image_of_points(points, imager, progress)
-    near, far = points[:, 2].min(), points[:, 2].max()
     depths = np.unique(points[:, 2])
+    near, far = depths[[0, -1]]
     if depths.size > (count := math.ceil((far - near) / _STEP / float(object_index(imager.sample))) + 1):
         depths = np.linspace(near, far, count)
     sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS, imager.sensor.origin)
@@ -435,8 +435,7 @@ def expose(
 def compile_exposure(shape: tuple[int, int], camera: Camera, seed: int, peak_electrons: float) -> Thread:
     """Compile `expose` for images of a shape, float32, in a thread while they are computed; join it before."""
     call = _expose, (jax.ShapeDtypeStruct(shape, jnp.float32), camera, jax.random.key(seed), peak_electrons)
-    thread = Thread(target=compile_at_once, args=[call], daemon=True)
-    thread.start()
+    (thread := Thread(target=compile_at_once, args=[call], daemon=True)).start()
     return thread
 
 
