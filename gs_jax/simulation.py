@@ -299,7 +299,7 @@ def simulate_volume(
     for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
         if not plane.any():
             continue
-        fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
+        fine = (plane * np.float32(1 / parts**2)).repeat(parts, 0).repeat(parts, 1)
         fine_grid = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
         image += np.asarray(forward(fine[None], imager, fine_grid, of_depth(depth)))
     return np.maximum(image, 0, out=image)  # an FFT's rounding may be below zero
