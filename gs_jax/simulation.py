@@ -327,9 +327,8 @@ def simulate_points(
     if kind == "full":
         return full_image_of_points(points, imager, progress)
     depths = np.unique(points[:, 2])
-    near, far = depths[[0, -1]]
-    if depths.size > (count := math.ceil((far - near) / _STEP / float(object_index(imager.sample))) + 1):
-        depths = np.linspace(near, far, count)
+    if depths.size > (count := math.ceil(np.ptp(depths) / _STEP / float(object_index(imager.sample))) + 1):
+        depths = np.linspace(depths[0], depths[-1], count)
     sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS, imager.sensor.origin)
     kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
     # Each point is between two depths of its slab, whose last depth is the first of the next slab.
