@@ -196,8 +196,7 @@ def _land(landed, place, lens, others, numbers, curve_first):
         air = math.hypot(x, y) / (away + t / n)
         glass = 1 / math.sqrt(n**2 + (n**2 - 1) * air**2) / (away + t / n)
         disc, toward = aperture + sag * air / n / 2 + (t + sag) * aperture / away, glass * (t - sag / 2)
-    sign = -1 if curve_first else 1
-    middle = sign * x * toward, sign * y * toward
+    middle = x * toward, y * toward
     # Where a point in air would send its rays from: the ray toward the disc's middle must meet it.
     source = x, y
     if shorter or index != 1:
