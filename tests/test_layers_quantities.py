@@ -15,12 +15,12 @@ from gs_jax.apps.drawings import draw_section
 from gs_jax.apps.explore_design import make_sliders
 from gs_jax.apps.tolerances import tolerance
 from gs_jax.base.errors import InputWarning
-from gs_jax.codesign.linear_error import lens_electrons, lost_power
+from gs_jax.codesign.linear_error import lost_power, spots_of_types
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet, overview
 from gs_jax.detection.view_samples import COARSE, search_grid
 from gs_jax.objectives.conditions import Conditions
-from gs_jax.optics.pupil import solid_angle
+from gs_jax.optics.pupil import solid_angle, transmittance
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
 
 from .helpers import quantities
@@ -80,8 +80,9 @@ def test_a_medium_takes_light():
     share = solid_angle(host, ray) * np.pi * float(values["clear_diameter"]) ** 2 / 4 / (4 * np.pi)
     each = values["light"] / values["lenses_per_point"]
     np.testing.assert_allclose(each, share, rtol=1e-6)
-    per_solid_angle = eqx.filter_jit(lens_electrons)(scope, Conditions(DEPTHS)) / share
-    np.testing.assert_allclose(per_solid_angle, 4 * np.pi * 1e4 * 20.0**2, rtol=1e-6)
+    narrow = spots_of_types(scope, Conditions(DEPTHS, clear_diameter=1e-3), jnp.zeros(1), jnp.zeros(1)).electrons[:, 0]
+    passed = solid_angle(host, ray) * transmittance(host, ray) * np.pi / 4 * 1e-3**2
+    np.testing.assert_allclose(narrow / passed, 1e4 * 20.0**2, rtol=1e-6)
 
 
 def test_the_error_of_volumes_in_a_medium():

@@ -186,7 +186,7 @@ def test_the_error_of_volumes_sees_the_pose():
     """Objects that turn and move with the array are seen as before; a tilt changes what is seen."""
     # Level too, but of the structure of those that lean: compiled once.
     lenses = gs.MicrolensArray(PLACES, size=(8.0, 8.0))
-    level = gs.Imager(lenses, gs.Sensor((700, 720), 0.016), 5.8, 2.5, tilt=(0.0, 0.0))
+    level = gs.Imager(lenses, gs.Sensor((1000, 1020), 0.016), 5.8, 2.5, tilt=(0.0, 0.0))
     at = gs.objectives.Conditions([19.0, 21.0])
     place = np.array([[0.4, -0.7]])
     # An eighth of a turn, which permutes the directions of frequencies.

@@ -1,28 +1,33 @@
 """Error of the best linear estimate of volumes: defocus, aberrations, light, noise and parallax in one number.
 
-Scenes are planes of random objects with edges, stationary and independent of each other. The best linear estimate
-(Wiener's) depends on second moments of scene, image and noise only, and treats each frequency `v` of the sensor by
-itself. Lens `j` images plane `k` with
+Scenes are planes of random objects with edges, as wide as the plate, stationary and independent of each other. The best
+linear estimate (Wiener's) depends on second moments of scene, image and noise only, and treats each frequency `v` of
+the sensor by itself. Lens `j` images plane `k` with
 
-    A_jk = sqrt(w_jk) H_k(v) L_k M_k exp(2 pi i v . r_j M_k)
+    A_jk = H_jk(v) L_jk M_k exp(2 pi i v . r_j M_k) / n_j^(1/2)
 
-for the envelope `w`, the transfer function `H`, the light `L` of a lit plane on the sensor, the magnification `M` and
-the lens's position `r_j` beside the object. For planes with the spectrum `S_k` and noise of the density `n` the
-relative error of plane `k` is the diagonal of
+for the transfer function `H`, the light `L` of a lit plane on the sensor, the magnification `M`, the lens's position
+`r_j` beside the object and the density `n_j` of its noise. For planes with the spectrum `S_k` the relative error of
+plane `k` is the diagonal of
 
-    (1 + S^(1/2) A* A S^(1/2) / n)^-1
+    (1 + S^(1/2) A* A S^(1/2))^-1
 
 (Kailath, Sayed and Hassibi, Linear Estimation, 2000, Theorem 3.2.1). No random numbers are drawn.
 
-Approximations: sub-images do not overlap (their light counts as noise where they do), the transfer function is its mean
-over a lens's field, and frequencies above Nyquist count as others do, since lenses sample an object with different
-parts of a pixel. For sparse scenes, solvers with a positivity constraint do better than any linear estimate. The paper
-has no such measure.
+All lenses of the plate count whose images are on the sensor: exact rays, Fresnel losses and the clear aperture give the
+light and the blur at each one's angle. Nothing ends at the field radius, which is that of back-projection.
+
+Approximations: where sub-images overlap, their light counts as noise; a lens differs from those of its type by its
+angle alone; and frequencies above Nyquist count as others do, since lenses sample an object with different parts of a
+pixel. For sparse scenes, solvers with a positivity constraint do better than any linear estimate. The paper has no such
+measure.
 
 An exposure is a time and a brightness, the same for all candidates: the electrons that each mm^2 of clear aperture at a
-distance of 20 mm in air collects from an emitter of 40 um x 40 um. So a smaller aperture pays for its sharpness with
-light, and a magnification for its detail.
+distance of 20 mm in air would collect without losses from an emitter of 40 um x 40 um. So a smaller aperture pays for
+its sharpness with light, and a magnification for its detail.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,20 +35,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..microscope.geometry import Imager, envelope
-from ..objectives.conditions import (
-    Conditions,
-    by_type,
-    clear_diameter,
-    field_heights,
-    field_radius,
-    finite_plate,
-    of_lenses,
-)
-from ..objectives.quantities import occupancy
+from ..microscope.geometry import Imager
+from ..objectives.conditions import Conditions, by_type, clear_diameter, finite_plate, of_lenses
 from ..optics import theory
-from ..optics.pupil import pupil_quadrature
-from ..optics.raytrace import trace_lenslet
+from ..optics.pupil import pupil_quadrature, solid_angle, transmittance
+from ..optics.raytrace import refract
 
 # Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
 _FILL, _LENGTH = 0.03, 0.05
@@ -51,21 +47,24 @@ _FILL, _LENGTH = 0.03, 0.05
 _READ_NOISE = 2.0
 # Nodes of the quadrature over frequencies, up to Nyquist of voxels of 40 um.
 _NODES = 16
-# Positions along a side of the part of the plate whose points see a whole field of lenses.
-_POSITIONS = 2
+# Squares along a side of the plate; an object in the middle of each stands for the square.
+_SQUARES = 2
+# Angles at which a lens is evaluated, and the largest tangent of these.
+_ANGLES, _WIDEST = 14, 1.2
+# Distance and side of the emitter that an exposure is defined by, mm.
+_EMITTER_DISTANCE, _EMITTER_SIDE = 20.0, 0.04
+# Rings of rays: enough for spots 25 periods wide.
+_RINGS = 20
+# Directions of frequencies over half a turn.
+_DIRECTIONS = 4
 
 
 def volume_error(imager: Imager, at: Conditions) -> Float[Array, ""]:
     """Relative error of volumes by the best linear estimate: the root of the mean of `lost_power` over the depths."""
-    return jnp.sqrt(jnp.mean(lost_power(imager, at, _positions(imager))))
-
-
-def _positions(imager: Imager) -> Float[Array, "position 2"]:
-    """Four points that stand for the plate, mm: a field radius from its edge, if it is large."""
     plate = finite_plate(imager)
-    inner = jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
-    side = jnp.asarray((np.arange(_POSITIONS) + 0.5) / _POSITIONS - 0.5, inner.dtype)
-    return jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * inner[None]
+    side = jnp.asarray((np.arange(_SQUARES) + 0.5) / _SQUARES - 0.5, plate.dtype)
+    positions = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * plate[None]
+    return jnp.sqrt(jnp.mean(lost_power(imager, at, positions)))
 
 
 def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position 2"]) -> Float[Array, " depth"]:
@@ -79,20 +78,29 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
         `(x, y)` of objects, mm; the result is the mean over them. The lenses around each give its parallax.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    dtype, finest = at.depths.dtype, 1 / (2 * _EMITTER_SIDE)
+    dtype, finest, magnification = at.depths.dtype, 1 / (2 * _EMITTER_SIDE), imager.magnification(at.depths)
     # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
     object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
     ring = jnp.asarray(weights, dtype) * object_frequency
-    frequency = object_frequency / jnp.mean(imager.magnification(at.depths))
-    spectrum = _spectrum(imager.magnification(at.depths)[:, None] * frequency[None])
-    amplitude = _amplitude(imager, at, frequency, spectrum)
+    frequency = object_frequency / jnp.mean(magnification)
+    spectrum = _spectrum(magnification[:, None] * frequency[None])
+    # So far is an object from the farthest lens.
+    widest = jnp.linalg.norm(finite_plate(imager)) * (1 - 1 / (2 * _SQUARES)) / imager.reduced_depth(at.depths[0])
+    tangents = jnp.minimum(widest, _WIDEST) * jnp.linspace(0, 1, _ANGLES, dtype=dtype)
+    spots = jax.tree.map(lambda values: of_lenses(imager, values), spots_of_types(imager, at, tangents, frequency))
+    views = jax.vmap(lambda position: _view(imager, at, position, tangents, spots.electrons))(positions)
+    noise = noise_density(imager, at, views)
     ways, planes = directions(dtype), jnp.eye(at.depths.size, dtype=dtype)
 
     def at_position(position):
-        weight, turns = _view(imager, at, position, ways)
+        view, noise = position
+        turns = 2 * jnp.pi * jnp.moveaxis(view.turns @ ways, -1, 0)
+        scale = view.on_sensor * view.electrons / (_EMITTER_SIDE**2 * magnification)[None]
+        power = jnp.einsum("lda,ldaf,df->ldf", view.angles, spots.power, spectrum)
+        amplitude = (scale / jnp.sqrt(noise)[:, None])[..., None] * safe_sqrt(power)
 
         def at_frequency(frequency, amplitude):
-            cos, sin = ((amplitude * weight)[None] * wave(frequency * turns) for wave in (jnp.cos, jnp.sin))
+            cos, sin = (amplitude[None] * wave(frequency * turns) for wave in (jnp.cos, jnp.sin))
             same = jnp.einsum("wlj,wlk->wjk", cos, cos) + jnp.einsum("wlj,wlk->wjk", sin, sin)
             other = jnp.einsum("wlj,wlk->wjk", cos, sin)
             real, imaginary = planes[None] + same, other - jnp.swapaxes(other, 1, 2)
@@ -103,49 +111,57 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
 
         return jax.vmap(at_frequency, (0, 2), 1)(frequency, amplitude)
 
-    left = jnp.mean(jax.lax.map(at_position, positions), 0)
+    left = jnp.mean(jax.lax.map(at_position, (views, noise)), 0)
     share = ring[None] * spectrum
     return jnp.sum(left * share, 1) / jnp.sum(share, 1)
 
 
-def _amplitude(imager, at, frequency, spectrum) -> Float[Array, "lens depth frequency"]:
-    """Amplitude with which each lens images each plane, relative to the noise."""
-    noise = jnp.sqrt(noise_density(imager, at))
-    amplitude = of_lenses(imager, lit_density(imager, at)) * imager.magnification(at.depths)[None] / noise[:, None]
-    power = of_lenses(imager, transfer_power(imager, at, frequency))
-    return amplitude[..., None] * safe_sqrt(power * spectrum[None])
+class View(NamedTuple):
+    """Views of an object at each depth by all lenses.
 
-
-def _view(imager, at, position, ways):
-    """Weights of the lenses `(lens, depth)`, and their images' phase over frequency `(direction, lens, depth)`."""
-    points = jnp.concatenate([jnp.tile(position, (at.depths.size, 1)), at.depths[:, None]], 1)
-    views = imager.views_of_all(points)
-    weight = safe_sqrt(envelope(jnp.sum(views.offset**2, -1), views.reduced_depth, field_radius(imager, at)))
-    return weight, 2 * jnp.pi * jnp.moveaxis((views.spot - imager.centers[:, None]) @ ways, -1, 0)
-
-
-def noise_density(imager: Imager, at: Conditions) -> Float[Array, " lens"]:
-    """Noise density of each lens's sub-image, electrons^2 per mm^2.
-
-    It is the shot noise of the planes and of the sub-images that overlap, whose light follows from the apertures, and
-    the read noise.
+    `electrons`: of an emitter of 40 um x 40 um. `on_sensor`: how much of the square that the object stands for is
+    imaged onto the sensor. `turns`: the image from the lens, mm. `angles`: weights of the angles at which lenses are
+    evaluated.
     """
-    own = of_lenses(imager, lit_density(imager, at))
-    over = occupancy(imager, at) * jnp.mean(own, 0)
-    return _FILL * jnp.sum(own + over[None], 1) + (_READ_NOISE / imager.sensor.pixel_pitch) ** 2
+
+    electrons: Float[Array, "lens depth"]
+    on_sensor: Float[Array, "lens depth"]
+    turns: Float[Array, "lens depth 2"]
+    angles: Float[Array, "lens depth angle"]
+
+
+def _view(imager, at, position, tangents, electrons) -> View:
+    points = jnp.concatenate([jnp.tile(position, (at.depths.size, 1)), at.depths[:, None]], 1)
+    views, sensor = imager.views_of_all(points), imager.sensor
+    tangent = safe_sqrt(jnp.sum(views.offset**2, -1)) / views.reduced_depth
+    # Linear between two angles; beyond the last as there, but for the law of the fourth power of the cosine.
+    place = jnp.minimum(tangent / tangents[-1], 1) * (_ANGLES - 1)
+    angles = jax.nn.relu(1 - jnp.abs(place[..., None] - jnp.arange(_ANGLES, dtype=place.dtype)[None, None]))
+    light = jnp.einsum("lda,lda,a->ld", angles, electrons, (1 + tangents**2) ** 2) / (1 + tangent**2) ** 2
+    half = jnp.asarray(sensor.shape[::-1], place.dtype) * (sensor.pixel_pitch / 2)
+    image = imager.magnification(at.depths)[:, None] * (finite_plate(imager) / _SQUARES)[None]
+    from_middle = jnp.abs(views.spot - jnp.asarray(sensor.origin, place.dtype)[None, None])
+    inside = (half[None, None] - from_middle) / image[None] + 0.5
+    return View(light, jnp.prod(jnp.clip(inside, 0, 1), -1), views.spot - imager.centers[:, None], angles)
+
+
+def noise_density(imager: Imager, at: Conditions, views: View) -> Float[Array, "position lens"]:
+    """Noise density of each lens's sub-image, electrons^2 per mm^2, for views of objects that stand for the plate.
+
+    It is the shot noise of the planes, the light of all sub-images, which overlap, spread over the sensor, and the
+    read noise.
+    """
+    sensor = imager.sensor
+    own = views.electrons @ imager.magnification(at.depths) ** -2
+    # All light that reaches the sensor from planes as large as the plate.
+    whole = jnp.mean(jnp.sum(views.on_sensor * views.electrons, (1, 2))) * jnp.prod(finite_plate(imager))
+    over = whole / (sensor.shape[0] * sensor.shape[1] * sensor.pixel_pitch**2)
+    return _FILL / _EMITTER_SIDE**2 * (own + over) + (_READ_NOISE / sensor.pixel_pitch) ** 2
 
 
 def _spectrum(frequency):
     """Power spectrum of random objects with edges, whose correlation falls exponentially (Debye), mm^2."""
     return _FILL * (1 - _FILL) * 2 * jnp.pi * _LENGTH**2 / (1 + (2 * jnp.pi * _LENGTH * frequency) ** 2) ** 1.5
-
-
-# Distance and side of the emitter that an exposure is defined by, mm.
-_EMITTER_DISTANCE, _EMITTER_SIDE = 20.0, 0.04
-# Rings of rays: enough for spots twenty periods wide.
-_RINGS = 16
-# Directions of frequencies over half a turn.
-_DIRECTIONS = 4
 
 
 def directions(dtype) -> Float[Array, "2 direction"]:
@@ -154,52 +170,56 @@ def directions(dtype) -> Float[Array, "2 direction"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-@by_type
-def transfer_power(
-    imager: Imager, at: Conditions, frequencies: Float[Array, " frequency"]
-) -> Float[Array, "depth frequency"]:
-    """Squared modulus of the transfer function, averaged over a lens's field and over directions.
+class Spots(NamedTuple):
+    """Electrons of an emitter of 40 um x 40 um under a lens; squared transfer function, the mean over directions."""
 
-    It is the Fourier transform of exact rays through the clear aperture, with defocus and all aberrations, times the
-    transfer functions of a perfect lens and of a pixel. The product is exact for spots much wider than the Airy disc
-    and for those without aberrations; between these limits it is a little low.
+    electrons: Float[Array, "*type depth angle"]
+    power: Float[Array, "*type depth angle frequency"]
+
+
+@by_type
+def spots_of_types(
+    imager: Imager, at: Conditions, tangents: Float[Array, " angle"], frequencies: Float[Array, " frequency"]
+) -> Spots:
+    """Light and blur of lenses at angles, by exact rays through the clear aperture with Fresnel losses; a row a type.
+
+    The transfer function is the Fourier transform of the rays, with defocus and all aberrations, times the transfer
+    functions of a perfect lens and of a pixel. The product is exact for spots much wider than the Airy disc and for
+    those without aberrations; between these limits it is a little low.
 
     Parameters
     ----------
     imager, at
         Lenses, and the depths.
+    tangents
+        Of the angles between the emitter and a lens's axis.
     frequencies
         On the sensor, 1/mm.
     """
-    points, weights = pupil_quadrature(clear_diameter(imager, at) / 2, _RINGS)
-    heights, ways = field_heights(imager, at), directions(at.depths.dtype)
+    diameter = clear_diameter(imager, at)
+    points, weights = pupil_quadrature(diameter / 2, _RINGS)
+    # Spots are symmetric about the field's direction, so that the other half of the directions gives the same.
+    ways = directions(at.depths.dtype)[:, : _DIRECTIONS // 2]
 
-    def power(depth, height):
-        rays = trace_lenslet(imager, depth, points, (height, jnp.zeros_like(height)))
-        lit = jnp.where(rays.valid, weights, 0)
-        # Rays with total reflection at the rim are missing. Phases are relative to the centroid.
-        middle = jnp.sum(lit[:, None] * rays.landing, 0) / jnp.maximum(jnp.sum(lit), 1e-6)
-        phase = 2 * jnp.pi * frequencies[:, None, None] * ((rays.landing - middle[None]) @ ways)[None]
-        real, imaginary = (jnp.einsum("r,frw->fw", lit, wave(phase)) for wave in (jnp.cos, jnp.sin))
-        return jnp.mean(real**2 + imaginary**2, 1)
+    def spot(depth, tangent):
+        height = tangent * imager.reduced_depth(depth)
 
-    powers = jax.lax.map(lambda depth: jax.vmap(power, (None, 0))(depth, heights), at.depths)
-    weight = envelope(heights[None] ** 2, imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
-    mean = jnp.einsum("dh,dhf->df", weight / jnp.sum(weight, 1, keepdims=True), powers)
-    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, clear_diameter(imager, at))
+        def through(point):
+            ray = refract(imager, depth, point, jnp.stack([height, jnp.zeros_like(height)]))
+            return ray.landing, jnp.where(ray.valid, solid_angle(imager, ray) * transmittance(imager, ray), 0)
+
+        landing, light = jax.vmap(through)(points)
+        light = weights * light
+        total = jnp.sum(light)
+        share = light / jnp.where(total > 0, total, 1)
+        # Phases are relative to the centroid.
+        from_middle = landing - jnp.sum(share[:, None] * landing, 0)[None]
+        phase = 2 * jnp.pi * frequencies[:, None, None] * (from_middle @ ways)[None]
+        real, imaginary = (jnp.einsum("r,frw->fw", share, wave(phase)) for wave in (jnp.cos, jnp.sin))
+        return total, jnp.mean(real**2 + imaginary**2, 1)
+
+    total, power = jax.lax.map(lambda depth: jax.vmap(spot, (None, 0))(depth, tangents), at.depths)
+    electrons = at.exposure.astype(total.dtype) * _EMITTER_DISTANCE**2 * (jnp.pi / 4 * diameter**2) * total
+    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
     others = theory.ideal_mtf(frequencies, cutoff) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
-    return mean * (others**2)[None]
-
-
-@by_type
-def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
-    """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
-    area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
-    # In a medium the lens takes a smaller solid angle.
-    return at.exposure.astype(area.dtype) * area * (_EMITTER_DISTANCE / imager.depth_in_medium(at.depths)) ** 2
-
-
-@by_type
-def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
-    """Electrons per mm^2 of the sensor in the image of a lit plane."""
-    return lens_electrons(imager, at) / (_EMITTER_SIDE * imager.magnification(at.depths)) ** 2
+    return Spots(electrons, power * (others**2)[None, None])
