@@ -233,7 +233,7 @@ def test_by_questions(lab, monkeypatch):
         ("52", "wavelength"),
         ("n", "imaging.wavelength_nm = 52: is it meant?"),
         ("530", ""),
-        ("", "how far beside its axis"),
+        ("", "radius of back-projection"),
     ]
     done = answered(monkeypatch, *(answer for answer, _ in answers))
     assert done.exit_code == 0, done.output

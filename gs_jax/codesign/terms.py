@@ -89,9 +89,11 @@ TERMS: dict[str, Term] = {
     "blur_um": Term("diameter of the thin lens's blur, in the object", _scaled(UM, objectives.blur)),
     "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", objectives.log_strehl, log=True),
     "wavefront_waves": Term("RMS wavefront error over the field", objectives.wavefront_error),
-    "lenses_per_point": Term("lenses that see a point, N_e", objectives.lenses_per_point),
-    "occupancy": Term("occupancy V (Eq. 11)", objectives.occupancy),
-    "light_percent": Term("share of a point's light that is used", _scaled(100, objectives.light)),
+    "lenses_per_point": Term("lenses within the field radius of a point, N_e", objectives.lenses_per_point),
+    "occupancy": Term("occupancy V of the lenses within the field radius (Eq. 11)", objectives.occupancy),
+    "light_percent": Term(
+        "share of a point's light that the lenses within the field radius collect", _scaled(100, objectives.light)
+    ),
     "field_of_view_mm": Term("width of the field of view", objectives.field_of_view),
     "thickness_mm": Term("thickness: filters, plate and sensor distance", _of_imager(objectives.thickness)),
     "fwhm_um": Term("full width at half maximum of the PSF on the axis, in the object", _scaled(UM, objectives.fwhm)),
@@ -110,7 +112,7 @@ TERMS: dict[str, Term] = {
     ),
     "coverage": Term("share of the plate that is clear aperture", objectives.coverage),
     "sag_mm": Term("height of a whole lens", objectives.sag),
-    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error),
+    "volume_error": Term("relative error of volumes by all lenses, best linear estimate, an exposure", volume_error),
     "edge_slope_deg": Term("slope at the clear aperture's rim", _scaled(180 / math.pi, objectives.edge_slope)),
     "least_radius_mm": Term("least radius of curvature of a lens's surface", objectives.surface_radius),
 }

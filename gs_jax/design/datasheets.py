@@ -245,7 +245,7 @@ def overview(design: Design, sheet: dict[str, Any], *, circle_of_confusion: floa
         f"light within {ends('half_light_radius_um')} um, RMS width {ends('rms_width_um')} um; Eq. 5 promises "
         f"{ends('lateral_resolution_um')} um, Eq. 6 {ends('axial_resolution_um')} um along z",
         f"{blurred} of {len(depths)} depths out of focus (blur above {_plain(limit)} um); "
-        f"{ends('lenses_per_point')} lenses see a point; occupancy {ends('occupancy')}",
+        f"{ends('lenses_per_point')} lenses within the field radius of a point; occupancy {ends('occupancy')}",
     ]
     return [line for line in lines if line]
 

@@ -163,7 +163,7 @@ class ImagingTable(Table):
         "`spectrum_file` names a CSV file with the header `wavelength_nm,light` that is read in its place",
     )
     field_radius_mm: Length = Field(
-        title="how far beside its axis, in the object, a lens still counts as seeing a point; sqrt(A_e / pi)"
+        title="radius of back-projection, in the object, sqrt(A_e / pi): a voxel sums the lenses so near"
     )
 
 

@@ -125,8 +125,8 @@ class Imager(eqx.Module):
     sensor_distance
         `v`, from the array's back to the sensor, mm: from the lens vertices, or from the plano face if that is behind.
     field_radius
-        `sqrt(A_e / pi)`, mm: largest distance of a point from a lens's axis at which the lens sees it (paper, "Field of
-        view"). It decides array shapes, so it is a plain number.
+        `sqrt(A_e / pi)`, mm: back-projection sums the lenses whose axes are so near to a voxel (paper, "Field of
+        view"). They see points farther off, as the full model does. It decides array shapes, so it is a plain number.
     rotation
         Of the array about the frame's origin, radians, from +x toward +y.
     shift

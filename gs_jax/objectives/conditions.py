@@ -40,7 +40,8 @@ class Conditions(eqx.Module):
     clear_diameter
         Clear diameter of the lenses, mm, where it is known; computed from the imager by default.
     field_radius
-        `sqrt(A_e / pi)`, mm, in place of the imager's own, which decides shapes and cannot be traced.
+        `sqrt(A_e / pi)`, mm, in place of the imager's own, which decides shapes and cannot be traced. `volume_error`
+        counts all lenses, whatever it is.
     height
         Of lenses of a tilted array that are evaluated as a level one, mm: depths are less by it, and sensor distances
         more. None, the default, is 0.

@@ -3,6 +3,9 @@
 The first are resolution, focus, light and Strehl ratio, the second spacing, gaps between apertures, height and slope of
 the lenses. The last are sizes of a point's image (PSF), seen in the object. They differ by a factor of ten where a
 sharp core stands in wide stray light: `fwhm` is the width of the core, `rms_width` and `spot_width` are of all light.
+
+What is said of a point's lenses, or of a lens's field, ends at the field radius, as the paper's back-projection does.
+`gs_jax.codesign.linear_error` counts all lenses.
 """
 
 import math
@@ -148,7 +151,7 @@ def blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 @whole_array
 def lenses_per_point(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
-    """Number of lenses that see a point, `N_e`: lenses on the plate over its area, times `A_e = pi r^2`."""
+    """Number of lenses within the field radius of a point, `N_e`: lenses on the plate over its area, times `pi r^2`."""
     at = as_conditions(imager, depths)
     return jnp.pi * field_radius(imager, at) ** 2 * _count(imager, at) / jnp.prod(finite_plate(imager))
 
@@ -160,9 +163,9 @@ def _count(imager, at):
 
 @whole_array
 def occupancy(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """Occupancy of the sensor, `V = N_e M^2` (Eq. 11), by all lenses.
+    """Occupancy of the sensor, `V = N_e M^2` (Eq. 11), by the lenses of all types.
 
-    The illuminated fraction of the sensor, for an object that fills the field.
+    The fraction of the sensor that the fields of the lenses fill, each as wide as the field radius.
     """
     at = as_conditions(imager, depths)
     return imager.magnification(at.depths) ** 2 * lenses_per_point(imager, at)
@@ -180,7 +183,7 @@ def coverage(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
 def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Share of a point's light that its `N_e` lenses collect, `N_e pi a^2 / (4 pi n^2 z'^2)` for a clear radius `a`.
 
-    `n` is the index of the object's medium.
+    `n` is the index of the object's medium. Losses are left out. All lenses collect several times as much.
     """
     at = as_conditions(imager, depths)
     away = imager.depth_in_medium(at.depths)
