@@ -1,9 +1,10 @@
 """Whether objectives rank designs as reconstructed scenes do: Spearman's correlations with a judge of reduced cost.
 
 Designs are the shipped ones and random ones, in focus or nearly. The judge is that of `experiments/design_judge.py` on
-a field of 1.2 mm, at 3,000 electrons. Its solver is Richardson-Lucy with a system matrix of rays and diffraction of its
-own, which takes seconds where the full model takes minutes; a scene counts with its best number of steps. The judge's
-own repeat is of other scenes and noise. In the better half of the designs focus is no longer what tells them apart.
+a field of 1.2 mm and the middle 8 mm of the sensor, at 3,000 electrons. Its solver is Richardson-Lucy with a system
+matrix of rays and diffraction of its own, which takes seconds where the full model takes minutes; a scene counts with
+its best number of steps. The judge's own repeat is of other scenes and noise. In the better half of the designs focus
+is no longer what tells them apart.
 
     python -m experiments.design_ranks [DESIGN.toml ...] [--records FILE] [--out DIR]
 
@@ -46,7 +47,7 @@ from gs_jax.reconstruction.inverse_problem import sum_pixels
 RANDOM = tuple(f"random {seed}" for seed in range(40))
 # Those for 18 to 23 mm that have a name; the last two are out of focus.
 NAMED = (*DESIGNS, "geomscope-exposure", "geomscope-table1", "geomscope-targets")
-SETTINGS = Settings(field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
+SETTINGS = Settings(sensor=8.0, field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
 STEPS = (4, 12)
 # Rays of a voxel to each lens, and voxels along a side that share them.
 RAYS, SHARED = 120, 3

@@ -20,7 +20,7 @@ PARTS = 4
 # At most so many neighbours cut an aperture.
 NEIGHBOURS = 16
 # Depth of a tile, mm, and the angle between its rays, which spreads them evenly.
-DEEP, TURN = 0.01, np.pi * (3 - 5**0.5)
+DEEP, TURN = 0.05, np.pi * (3 - 5**0.5)
 
 
 def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -> np.ndarray:
@@ -30,8 +30,8 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
     neighbour's surface is higher, which is half-way for identical lenses. A tilted array is traced in its own frame, in
     which emitters and the sensor are turned about the point of the vertices' plane above the sensor's centre.
 
-    With a `tile`, mm, emitters within a square of that width and a hundredth of a millimetre in depth share the rays of
-    their mean place, displaced by the magnification: many times the rays for the same time. Spots must hardly change
+    With a `tile`, mm, emitters within a square of that width and a twentieth of a millimetre in depth share the rays of
+    their mean place, displaced as chief rays are: many times the rays for the same time. Spots must hardly change
     within a tile.
     """
     images = np.zeros((PARTS, *imager.sensor.shape))
@@ -158,26 +158,33 @@ def _bundles(places, lenses, near, numbers, curve_first, landed, magnification):
         for lens in range(len(lenses)):
             others = lenses[near[lens]]
             others[:, :2] -= lenses[lens, :2]
-            magnification[number] = _land(landed[number, lens], place, lenses[lens], others, numbers, curve_first)
+            magnification[number], _ = _land(landed[number, lens], place, lenses[lens], others, numbers, curve_first)
 
 
 @njit(fastmath=True, error_model="numpy")
 def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
     place = tile[:, 0].mean(), tile[:, 1].mean(), tile[:, 2].mean()
-    magnification = _land(landed, place, lens, others, numbers, curve_first)
-    pixel, origin = numbers[3], numbers[4]
+    magnification, reduced = _land(landed, place, lens, others, numbers, curve_first)
+    pixel, origin, index = numbers[3], numbers[4], numbers[7][2]
     for x, y, share in landed:
         if share > 0:
             for one in tile:
-                row = math.floor((y - magnification * (one[1] - place[1]) - origin[1]) / pixel + image.shape[0] / 2)
-                column = math.floor((x - magnification * (one[0] - place[0]) - origin[0]) / pixel + image.shape[1] / 2)
+                # By how much the magnification is larger than in the middle.
+                larger = magnification * (place[2] - one[2]) / (reduced * index + one[2] - place[2])
+                at_x = x - magnification * (one[0] - place[0]) + larger * (lens[0] - one[0]) - origin[0]
+                at_y = y - magnification * (one[1] - place[1]) + larger * (lens[1] - one[1]) - origin[1]
+                row = math.floor(at_y / pixel + image.shape[0] / 2)
+                column = math.floor(at_x / pixel + image.shape[1] / 2)
                 if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
                     image[row, column] += share * one[3]
 
 
 @njit(fastmath=True, error_model="numpy")
 def _land(landed, place, lens, others, numbers, curve_first):
-    """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
+    """Trace rays to where they land, x, y, mm, and their share of the point's light.
+
+    Returns the magnification and the reduced distance, mm.
+    """
     n, t, v, _, _, turned, faces, sample, windows = numbers
     contact, begins, index, shorter = sample[0] == 1, sample[1], sample[2], sample[3]
     radius, conic, aperture = lens[2:]
@@ -243,7 +250,8 @@ def _land(landed, place, lens, others, numbers, curve_first):
             hit_x, hit_y = hit_x + thickness * ray[0] / ray[2], hit_y + thickness * ray[1] / ray[2]
         landed[i, 0], landed[i, 1], landed[i, 2] = hit_x, hit_y, light * angle * passed
     v -= (windows[:, 0] * (1 - 1 / windows[:, 1])).sum()
-    return (v + t / n) / away if curve_first else v / (away + t / n)
+    reduced = away if curve_first else away + t / n
+    return (v + t / n if curve_first else v) / reduced, reduced
 
 
 @njit(fastmath=True, error_model="numpy")

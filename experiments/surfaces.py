@@ -1,15 +1,16 @@
 """Sheets fitted to ray-traced captures: depth, focus and volume, beside free voxels and the unrolled inversion.
 
 A tilted snowflake, a curved leaf with veins, a hemisphere with texture, two sheets one behind the other, and blobs,
-which are no sheet, are traced through the lenses about the middle of a design. Columns: mean and standard deviation of
-the depth's error over lit columns, but steep rims; how many errors are within one predicted standard deviation; PSNR
-above an empty image or volume, blurred by one voxel, of the image in focus and of the volume, where the truth has each
-emitter on its nearest plane, or in linear shares of two; that of the truth's own shares; that of the unrolled
-inversion; what the sheets, and one sheet more, leave of the capture. Scenes without one depth have one exposure.
+which are no sheet, all 9 mm wide, are traced through all lenses of a design onto its whole sensor. Columns: mean and
+standard deviation of the depth's error over lit columns, but steep rims; how many errors are within one predicted
+standard deviation; PSNR above an empty image or volume, blurred by one voxel, of the image in focus and of the volume,
+where the truth has each emitter on its nearest plane, or in linear shares of two; that of the truth's own shares; that
+of the unrolled inversion; what the sheets, and one sheet more, leave of the capture. Scenes without one depth have one
+exposure.
 
     python -m experiments.surfaces [--design geomscope] [--scenes "curved leaf,hemisphere"] [--out DIR]
 
-Writes `surfaces.md`, `surfaces.json` and `surfaces.png`; about twenty minutes on two cores for all scenes.
+Writes `surfaces.md`, `surfaces.json` and `surfaces.png`. TIMES
 """
 
 import time
@@ -20,19 +21,20 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from experiments.common import Report, cropped, design_file, main, names_of, tables_report
+from experiments.common import Report, design_file, main, names_of, tables_report
 from experiments.phantoms import snowflake
 from experiments.ray_tracer import traced
-from gs_jax import Grid, Imager, Progress, Reconstructor, Sensor, Surface, quality, rasterize, read_design
+from gs_jax import Grid, Imager, Progress, Reconstructor, Surface, quality, rasterize, read_design
+from gs_jax.io.camera import Readout
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.reconstruction.surface_fit import fit_sheets
 
-PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)
+# Width of the scenes and of pixels, at least, mm.
+WIDTH, PITCH, VOXEL, STEP, DEPTHS = 9.2, 0.009, 0.08, 0.5, (18.0, 23.0)
 ELECTRONS, READ = (10_000, 500), 2.0
 STEEPEST = np.deg2rad(60)
-# Rays of each tile toward each lens, the width of a tile, and the distance from an emitter to the next, mm. With a
-# tenth of these rays their noise would exceed that of 10,000 electrons.
-RAYS, TILE, APART = 1000, 0.1, 0.02
+# Rays of each tile toward each lens, the width of a tile, and the distance from an emitter to the next, mm.
+RAYS, TILE, APART = 300, 0.1, 0.02
 
 # Scenes with one depth in each column.
 SHEETS = ("tilted snowflake", "curved leaf", "hemisphere")
@@ -55,14 +57,15 @@ COLUMNS = {
 Emitters = Float[np.ndarray, "emitter 4"]
 
 
-def device(design: str, pixels: int = PIXELS) -> Imager:
-    """The lenses of a design about the middle, and a sensor there."""
-    imager = cropped(read_design(design_file(design)).imager(), pixels, reach=pixels * PITCH / 2 + 2.0)
-    return eqx.tree_at(lambda i: i.sensor, imager, Sensor((pixels, pixels), PITCH))
+def device(design: str) -> Imager:
+    """A design, whose pixels are binned to the width of those that voxels need."""
+    imager = read_design(design_file(design)).imager()
+    side = max(int(PITCH / imager.sensor.pixel_pitch + 0.02), 1)
+    return eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=side).sensor(imager.sensor))
 
 
 def make_scenes(width: float) -> dict[str, Emitters]:
-    """Emitters `(x, y, z, intensity)` of each scene, for a sensor of this width, mm."""
+    """Emitters `(x, y, z, intensity)` of each scene, of this width, mm."""
     near, far = DEPTHS
     middle, half = (near + far) / 2, (far - near) / 2
     flake = snowflake((middle, middle), 0.8 * width, width=min(0.7, 0.8 * width / 14.5), pitch=APART)
@@ -91,7 +94,7 @@ def make_scenes(width: float) -> dict[str, Emitters]:
 
 
 def blobs(width: float, seed: int) -> Emitters:
-    """60 Gaussian blobs at random places, for a sensor of this width, mm."""
+    """60 Gaussian blobs at random places, of this width, mm."""
     rng, middle = np.random.default_rng(seed), float(np.mean(DEPTHS))
     sizes = np.array([0.35 * width, 0.35 * width, (DEPTHS[1] - DEPTHS[0]) / 2 - 0.2])
     middles = rng.uniform(-sizes, sizes, (60, 3)) + [0, 0, middle]
@@ -150,7 +153,8 @@ class Methods:
     """What is compared, with the tables of one device: functions of an image and a progress display."""
 
     def __init__(self, imager: Imager, progress: Progress):
-        self.grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0], DEPTHS[1] + 0.01, STEP), pitch=VOXEL)
+        side = round(WIDTH / VOXEL) | 1
+        self.grid = Grid(np.arange(DEPTHS[0], DEPTHS[1] + 0.01, STEP), (side, side), VOXEL)
         self.sheet = Reconstructor(imager, self.grid, Surface(), progress=progress)
         self.sheets = self.sheet.by(Surface(2))
         self.unrolled = Reconstructor(imager, self.grid, METHODS["unrolled"](20), progress=progress)
@@ -196,7 +200,7 @@ def picture(results: list[dict]) -> Figure:
     """Brightness, depth and true depth of each sheet at the first exposure."""
     sheets = [r for r in results if "sd_mm" in r and r["electrons"] == ELECTRONS[0]]
     figure = Figure(figsize=(9, 2.9 * len(sheets)), layout="constrained")
-    half = PIXELS * PITCH / 2
+    half = WIDTH / 2
     for row, each in enumerate(sheets):
         for column, title in enumerate(("brightness", "depth, mm", "truth, mm")):
             axes = figure.add_subplot(len(sheets), 3, 3 * row + column + 1)
@@ -212,7 +216,7 @@ def picture(results: list[dict]) -> Figure:
 
 
 def report(design: str, scenes: list[str], progress: Progress) -> Report:
-    imager, all_scenes = device(design), make_scenes(PIXELS * PITCH)
+    imager, all_scenes = device(design), make_scenes(WIDTH)
     methods, results = Methods(imager, progress), []
     for name in scenes:
         emitters = all_scenes[name]
