@@ -10,8 +10,7 @@ exposure.
 
     python -m experiments.surfaces [--design geomscope] [--scenes "curved leaf,hemisphere"] [--out DIR]
 
-Writes `surfaces.md`, `surfaces.json` and `surfaces.png`; three minutes of a core for a scene and an exposure,
-but for the unrolled inversion.
+Writes `surfaces.md`, `surfaces.json` and `surfaces.png`; four minutes of a core for a scene and an exposure.
 """
 
 import time
