@@ -11,7 +11,7 @@ second table has what the full model leaves of images without noise; with `--ima
         [--rays 1200] [--width 1.0] [--images {rays,model}] [--records FILE]
 
 Writes the records after each scene, from which the next run goes on, and then `design_judge.md`. A scene and
-an exposure take four minutes of a core for the paper's lenses, and longer for sharp ones.
+an exposure take four minutes of a core for the paper's lenses, more than thirteen for sharp ones.
 """
 
 import hashlib
