@@ -444,12 +444,16 @@ class Reconstructor(eqx.Module):
         sieves = [seen.sieve]
         if isinstance(method.sieve, tuple):
             sieves = [jnp.asarray(sieve, start.light.dtype) for sieve in method.sieve]
+        if not left_out.any():
+            sieves = sieves[:1]
         ways = [advanced(level._begun(seen._replace(sieve=s), before), min(_ROUND, steps)) for s in sieves]
         best = min(error for error, _ in ways)
-        error, state = [way for way in ways if way[0] <= (1 + _SLACK) * best][-1]
+        error, state = ([way for way in ways if way[0] <= (1 + _SLACK) * best] or ways[:1])[-1]
         for taken in range(_ROUND, steps, _ROUND):
+            if state.cost < state.target or state.residual < method.tolerance:
+                break
             last, (error, state) = error, advanced(state, min(_ROUND, steps - taken))
-            if error > (1 - _GAIN) * last or state.cost < state.target:
+            if left_out.any() and error >= (1 - _GAIN) * last:
                 break
         return state
 

@@ -199,10 +199,9 @@ class Plan:
 
 
 class LastVolume(NamedTuple):
-    """State of the last image, its sieve and light, and what the last one that took all steps left of its light."""
+    """State of the last image, its light, and what the last one that took all steps left of its light."""
 
     solver: LucyState
-    sieve: Any
     light: float
     unexplained: float
 
@@ -221,7 +220,7 @@ def follow_volume(
     follows = last is not None and abs(light - last.light) < _COLD_CHANGE * last.light and bool(last.solver.x.any())
     target = _TARGET_RATIO * last.unexplained * light if last and follows else 0.0
     if last and follows:
-        state = reconstructor.init(image, _restart(last.solver))._replace(sieve=last.sieve)
+        state = reconstructor.init(image, _restart(last.solver))
         state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
     else:
         state = reconstructor.solve(image, progress)
@@ -229,9 +228,7 @@ def follow_volume(
     unexplained = last.unexplained if last else 0.0
     if state.cost >= target:
         unexplained = state.cost / light if light > 0 else 0.0
-    return np.asarray(reconstructor.finish(state), np.float32), LastVolume(
-        state.solver, state.sieve, light, unexplained
-    )
+    return np.asarray(reconstructor.finish(state), np.float32), LastVolume(state.solver, light, unexplained)
 
 
 @jax.jit

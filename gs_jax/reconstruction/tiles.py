@@ -282,7 +282,7 @@ def _started(local: Reconstructor, state: State, field: Field, so_far: Volume) -
     rest = jnp.asarray(field.image) - own
     if isinstance(method, RichardsonLucy):
         state = state._replace(background=state.background + jnp.maximum(rest, 0))
-        free = dataclasses.replace(method, background=state.background, min_sensitivity=0.0)
+        free = dataclasses.replace(method, background=state.background, sieve=state.sieve, min_sensitivity=0.0)
         solver = start_solver(free, state.light, local.problem)
         sensitivity = solver.sensitivity
         if method.min_sensitivity is not None:

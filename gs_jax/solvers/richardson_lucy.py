@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide
-from ..base.errors import InputError
+from ..base.errors import InputError, short_repr
 from ..base.typing import Real
 from .base import (
     Operator,
@@ -42,7 +42,7 @@ _DARK = 1e-2
 _ROUNDING = 100
 # Uniform share of the volume from which the next image of a recording starts.
 _UNIFORM = 0.1
-# Steps on voxels four times and twice as wide, and on its own, of those that it has.
+# Steps on voxels four times and twice as wide, and on those of the volume, relative to `steps`.
 _SHARES = 2, 1.5, 0.6
 # Widest sieve, voxels, and the reach of its Gaussian.
 WIDEST_SIEVE, _REACH = 2.0, 6
@@ -98,14 +98,14 @@ class RichardsonLucy(eqx.Module):
     sieve
         Standard deviation, in voxels, of a lateral Gaussian `K`: the estimate is `K a`, with `a` found for `A K`, so
         that no noise is finer (Snyder and Miller, IEEE Trans. Nucl. Sci. 32, 3864, 1985). At most 2: wider voxels cost
-        less. 0, kept as None, is no sieve. Of several, from narrow to wide, `reconstruct` takes the last that
-        predicts squares of pixels about as well as any which are held out of steps on wider voxels; and the first in
-        volumes too small for these.
+        less. Light reaches the neighbours of voxels that pixels see. 0, kept as None, is no sieve. `reconstruct` takes
+        several, from narrow to wide: on wider voxels it leaves out squares of pixels, and chooses the widest sieve that
+        predicts them nearly as well as any. Without such steps it takes the first.
 
     Raises
     ------
     InputError
-        If an option is negative, `steps` is 0, `background_knots` is 1, or `sieve` above 2.
+        If an option is negative, `steps` is 0, `background_knots` is 1, or `sieve` is not as above.
 
     Examples
     --------
@@ -126,15 +126,21 @@ class RichardsonLucy(eqx.Module):
     tv: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
     background_knots: int = eqx.field(static=True, default=0)
     min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
-    sieve: Real | tuple[Real, ...] | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
+    sieve: Real | tuple[Real, ...] | Float[Array, ""] | None = eqx.field(
+        converter=lambda sieve: tuple(sieve) if isinstance(sieve, list) else none_if_zero(sieve), default=0.0
+    )
 
     def __check_init__(self):
         check_options(self)
         if self.background_knots == 1 or self.background_knots < 0:
             raise InputError(f"background_knots must be 0, or 2 or more, got {self.background_knots}.")
         sieves = self.sieve if isinstance(self.sieve, tuple) else (self.sieve,)
-        if any(isinstance(sieve, int | float) and not 0 <= sieve <= WIDEST_SIEVE for sieve in sieves) or not sieves:
-            raise InputError(f"sieve must be 0 to {WIDEST_SIEVE:g} voxels, got {self.sieve}.")
+        # Other leaves are arrays of JAX or their placeholders.
+        known = [sieve for sieve in sieves if isinstance(sieve, int | float | str | np.generic | np.ndarray)]
+        if not sieves or any(isinstance(sieve, str) or not 0 <= sieve <= WIDEST_SIEVE for sieve in known):
+            raise InputError(f"sieve must be 0 to {WIDEST_SIEVE:g} voxels, got {short_repr(self.sieve)}.")
+        if len(known) == len(sieves) and sorted(known) != known:
+            raise InputError(f"sieve must go from narrow to wide, got {short_repr(self.sieve)}.")
 
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
@@ -171,7 +177,7 @@ class RichardsonLucy(eqx.Module):
     def stages(self, count: int) -> "list[RichardsonLucy]":
         """Stages of a solver on so many grids of wider voxels, each twice as narrow as the last, and on its own."""
         scaled = lambda wide: jax.tree.map(lambda sieve: sieve / 2**wide, self.sieve)
-        solvers = stages(self, count, shares=_SHARES)
+        solvers = stages(self, count, shares=_SHARES[-1 - count :])
         return [dataclasses.replace(one, sieve=scaled(count - i)) for i, one in enumerate(solvers)]
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
@@ -199,9 +205,11 @@ class RichardsonLucy(eqx.Module):
         if self.sieve is None:
             return x
         if isinstance(self.sieve, tuple):
-            raise InputError(f"sieve must be one number but with reconstruct, got {self.sieve}.")
+            raise InputError(f"sieve must be one number but with reconstruct, got {short_repr(self.sieve)}.")
         width = jnp.maximum(jnp.asarray(self.sieve, x.dtype), _NO_SIEVE)
         taps = jnp.exp(-0.5 * (jnp.arange(-_REACH, _REACH + 1, dtype=x.dtype) / width) ** 2)
+        # Voxels that no pixel sees stay so.
+        taps = jnp.where(taps > jnp.finfo(x.dtype).eps, taps, 0)
         return blurred(x, taps / taps.sum())
 
 
@@ -293,7 +301,7 @@ def multiplied(
     """State after the step from `point = extrapolate(state)` by the back-projected ratio."""
     new, momentum = divide(point * jnp.maximum(back, 0), state.sensitivity), state.momentum
     if momentum:
-        # The slope of the likelihood is `back - A'1`.
+        # `back - A'1` is the slope of the likelihood, where nothing bounds the sensitivity.
         uphill = jnp.vdot(back - state.sensitivity, new - state.x) >= 0
         momentum = state.x, jnp.where(uphill, momentum[1] + 1, 0).astype(momentum[1].dtype)
     return State(new, state.sensitivity, momentum, background_step(state.knots, ratio, kept))
