@@ -9,8 +9,7 @@ import pytest
 
 from gs_jax.base import caches
 from gs_jax.base.caches import cache_by_value, cached_on_disk
-from gs_jax.base.progress import VERBOSE, verbosity
-from gs_jax.base.workers import map_in_threads, run_jobs
+from gs_jax.base.workers import map_in_threads
 
 
 class Counted:
@@ -108,23 +107,3 @@ def test_results_of_threads_are_in_the_order_of_the_items():
     )
     with pytest.raises(ZeroDivisionError):
         list(map_in_threads(lambda item: 1 / item, [1, 0, 2]))
-
-
-def test_jobs_get_the_results_that_they_need_and_others_run_meanwhile():
-    level, both = verbosity.set(VERBOSE), threading.Barrier(2, timeout=10)
-
-    def meet(number):
-        both.wait()
-        return number + 1
-
-    # "sum" is before what it needs, and "alone" runs beside "first", or neither would end.
-    jobs = {
-        "sum": (lambda one, other: one + other, "first", "alone"),
-        "first": (lambda: meet(1),),
-        "alone": (lambda: meet(10),),
-        "level": (verbosity.get,),
-    }
-    assert run_jobs(jobs) == {"sum": 13, "first": 2, "alone": 11, "level": VERBOSE}
-    verbosity.reset(level)
-    with pytest.raises(ZeroDivisionError):
-        run_jobs({"wrong": (lambda: 1 / 0,), "after": (str, "wrong")})

@@ -1,8 +1,9 @@
 """The example pipeline of `gs-jax demo`: evaluates and optimises a microscope, images with it, and makes its mold."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
+from contextvars import copy_context
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,10 +16,9 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from ..base.machine import release_memory
+from ..base.machine import release_memory, share_heaps
 from ..base.progress import Progress
 from ..base.typing import PathLike
-from ..base.workers import run_jobs
 from ..codesign.search import run_study
 from ..codesign.search_report import as_records, write_outcome
 from ..design.datasheets import datasheet, findings
@@ -111,38 +111,34 @@ def run(folder: PathLike, progress: Progress | None = None) -> Path:
         with _timed(seconds, "mold"):
             return make_mold(design, folder / "mold.stl", progress=progress)
 
-    def report(image, volume, points) -> None:
-        shown = {"image": image, "volume": volume, "grid": grid, "points": points[0], "notes": _NOTES}
+    share_heaps()
+    with ThreadPoolExecutor(1) as thread:
+        # Beside the others, as it needs NumPy alone. Compiled programs are not safe to run at once.
+        making = thread.submit(copy_context().run, mold)
+        image = _image_words(folder, imager, seconds, progress)
+        sheet = evaluate()
+        targets = _optimise(folder, seconds, progress)
+        views = _back_project(imager, planes, seconds, progress, image)
+        found = {name: solve(name, image) for name in reversed(solvers)}
+        points, score = _image_points(folder, imager, seconds, progress)
         with _timed(seconds, "report"):
+            shown = {"image": image, "volume": found[_BEST], "grid": grid, "points": points, "notes": _NOTES}
             write_report(folder / "report.html", design, **shown, progress=progress)
-
-    # In an order in which the longest is not last, and what takes much memory is seldom beside its like.
-    jobs = {
-        "image": (partial(_image_words, folder, imager, seconds, progress),),
-        "sheet": (evaluate,),
-        "targets": (partial(_optimise, folder, seconds, progress),),
-        "mold": (mold,),
-        _BEST: (partial(solve, _BEST), "image"),
-        "points": (partial(_image_points, folder, imager, seconds, progress),),
-        "report": (report, "image", _BEST, "points"),
-        **{name: (partial(solve, name), "image") for name in solvers if name != _BEST},
-        "views": (partial(_back_project, imager, planes, seconds, progress), "image"),
-    }
-    results = run_jobs(jobs)
+        checks = making.result()
     truth = gaussian_filter(np.asarray(rasterize(words(_SCENE_MM), grid)), (0, 1, 1))
-    volumes = {_TRUTH: truth} | results["views"] | {name: results[name] for name in reversed(solvers)}
+    volumes = {_TRUTH: truth} | views | found
     write_volume(folder / "words.ome.tif", volumes[_BEST], grid)
     scores = {"nothing (all zero)": quality(np.zeros_like(truth), truth)}
     scores |= {name: quality(volume, truth) for name, volume in volumes.items() if name != _TRUTH}
     with progress.step("Drawing"):
-        write_figure(folder / "words.png", _draw_words(results["image"], imager.sensor, volumes, scores, grid))
+        write_figure(folder / "words.png", _draw_words(image, imager.sensor, volumes, scores, grid))
     context = {
         "distances": nearest_neighbour_distances(np.array(design.array.centers_mm)),
-        "findings": findings(design, results["sheet"]),
-        "targets": results["targets"],
+        "findings": findings(design, sheet),
+        "targets": targets,
         "scores": scores,
-        "points": results["points"][1],
-        "mold": results["mold"],
+        "points": score,
+        "mold": checks,
         "seconds": seconds,
     }
     write_text(folder / "report.md", page.render(context), [".md"])
@@ -192,7 +188,6 @@ def _image_points(folder: Path, imager: Imager, seconds: dict, progress: Progres
         light = simulate(truth, imager, progress=progress)
         image = _expose(light, folder / "points.tif", seed=1)
     del light
-    release_memory()
     with _timed(seconds, "finding points"):
         grid = Grid.over(imager.sensor, depths=_POINT_DEPTHS, pitch=_POINT_VOXEL_MM)
         found = find_points(image, imager, grid, progress=progress)
@@ -214,6 +209,7 @@ def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
     seconds[step], started = 0.0, perf_counter()  # in the order in which they start
     yield
     seconds[step] = perf_counter() - started
+    release_memory()
 
 
 def _draw_words(

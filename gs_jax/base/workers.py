@@ -11,15 +11,13 @@ import signal
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextvars import copy_context
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 from .._version import __version__
 from .errors import InputError, input_error, needs_extra
-from .machine import release_memory, share_heaps
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -31,8 +29,6 @@ _MAX_THREADS = 8
 _AHEAD = 2
 # Seconds: timeout of the scheduler, timeout of closing, and between two counts of the workers.
 _ANSWER, _END, _RECOUNT = 10, 2, 1.0
-# Seconds after which memory is released that jobs in threads have freed.
-_RELEASE = 2.0
 _lock = threading.Lock()
 # The function that this worker calls, by token.
 _functions: dict[str, Callable[[Any], Any]] = {}
@@ -42,34 +38,6 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
     """`map` with a thread per core, for NumPy code, which releases Python's lock; results are in the items' order."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_THREADS)) as threads:
         yield from threads.map(function, items)
-
-
-def run_jobs(jobs: Mapping[str, tuple[Any, ...]], count: int = 2) -> dict[str, Any]:
-    """Run jobs that need each other's results, some at once, in threads; return the results by name.
-
-    Compilers and tracing use one core each, so that two jobs at once take little more time than one.
-
-    Parameters
-    ----------
-    jobs
-        By name, a function and the names of the jobs whose results are its arguments. A free thread takes the first
-        job whose arguments are known.
-    count
-        Number of threads.
-    """
-    waiting, running, results = dict(jobs), {}, {}
-    share_heaps()
-    with ThreadPoolExecutor(count) as threads:
-        while len(results) < len(jobs):
-            ready = [name for name, (_, *needs) in waiting.items() if results.keys() >= set(needs)]
-            for name in ready[: count - len(running)]:
-                function, *needs = waiting.pop(name)
-                arguments = [results[need] for need in needs]
-                running[threads.submit(copy_context().run, function, *arguments)] = name
-            done, _ = wait(running, _RELEASE, FIRST_COMPLETED)
-            results |= {running.pop(job): job.result() for job in done}
-            release_memory()
-    return results
 
 
 def compile_at_once(*calls: tuple[Any, tuple]) -> None:
