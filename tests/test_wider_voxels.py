@@ -1,7 +1,5 @@
 """First steps on wide voxels and pixels, from which a reconstruction goes on with narrow ones."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -90,7 +88,7 @@ def test_noise_decides_on_the_sieve(bright_square):
     chosen = gs.Reconstructor(imager, grid, METHODS["richardson-lucy"](20), "pinhole")
     smooth = gaussian_filter(truth, (0, 3, 3))
     np.testing.assert_allclose([sieve_of(chosen, scene) for scene in (points, smooth)], [0, 1.4], rtol=1e-6)
-    given = gs.Reconstructor(imager, grid, dataclasses.replace(METHODS["richardson-lucy"](20), sieve=0.6), "pinhole")
+    given = gs.Reconstructor(imager, grid, gs.RichardsonLucy(20, sieve=0.6), "pinhole")
     assert float(sieve_of(given, points)) == pytest.approx(0.6)
 
 

@@ -59,8 +59,8 @@ class MethodOptions(OptionGroup):
         optics: Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.
         tv: Weight of total variation (richardson-lucy, admm).
         sparsity: Weight of the sum of voxels (fista, admm).
-        sieve: Standard deviation, in voxels, of the finest detail (list-rl, richardson-lucy). [default: 1.4, or 0 where
-            large volumes need finer detail to predict pixels that are held out; 0 in small volumes and tiles]
+        sieve: Standard deviation, in voxels, of the finest detail (list-rl, richardson-lucy; not in tiles). [default:
+            1.4, or 0 where pixels that are held out ask for it; 0 in volumes below 96 voxels a side, recordings, tiles]
         stop_at_noise: Stop early when all but noise is explained (list-rl to admm in --method).
         suppress: Background suppression: points on which their lenses agree, the paper's clusters, or a network.
         weights: WEIGHTS.npz of `gs-jax train`, for --method unrolled or --suppress unet. [default: ours]
@@ -195,6 +195,7 @@ def reconstruct_command(
             provenance = camera.recorded(provenance_of(capture, options.weights, *camera.files, design=microscope))
             provenance |= frame.note if imager.sample is not None else {}
             provenance |= {SCORE: predicted} if predicted else {}
+            provenance |= {} if result.sieve is None else {"sieve": f"{result.sieve:.3g} voxels"}
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)
             if points and result.points is not None:
                 write_points(points, *frame.points(result.points, result.statistics), provenance=provenance | INTENSITY)
@@ -205,6 +206,8 @@ def reconstruct_command(
     click.echo(f"{output}: {voxels(result.volume.shape, 'z, y, x', plan.grid.pitch, depths, imager)}")
     if residual:
         click.echo(f"{output}: imaged again it is {format_residual(residual)}")
+    if result.sieve is not None:
+        click.echo(f"{output}: --sieve {result.sieve:.3g}, by pixels that were held out")
     if predicted:
         click.echo(f"{output}: {predicted}")
     if fit := result.surface:

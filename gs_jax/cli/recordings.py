@@ -312,7 +312,7 @@ def _frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False
 
     `is_live` compiles all before the first frame comes.
     """
-    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
+    image_of, reconstruct = camera.frames(recording), plan.of_frames.prepare(Progress())
     if is_live:
         with suppress(InputError):
             reconstruct(_image_to_compile_for(plan), Progress())

@@ -42,7 +42,7 @@ _COLD_CHANGE = 0.5
 class Result(NamedTuple):
     """Reconstruction of an image: volume, points if asked for, their statistics as columns, a warning, and sheets.
 
-    `last` is what the next frame of a recording may start from.
+    `last` is what the next frame of a recording may start from; `sieve` the one that was chosen from the image.
     """
 
     volume: Any
@@ -51,6 +51,7 @@ class Result(NamedTuple):
     warning: str | None = None
     surface: SurfaceFit | None = None
     last: Any = None
+    sieve: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,6 +130,14 @@ class Plan:
         return dataclasses.replace(self, network=network, reconstructor=reconstructor, sharpness=sharp)
 
     @property
+    def of_frames(self) -> "Plan":
+        """The plan for a recording, of which no frame chooses a sieve of its own."""
+        if not isinstance(sieve := getattr(self.method, "sieve", None), tuple):
+            return self
+        method: Any = self.method
+        return dataclasses.replace(self, method=dataclasses.replace(method, sieve=sieve[0]))
+
+    @property
     def reads_pixels_once(self) -> bool:
         """Whether an image is only back-projected, as the camera's integers, too."""
         return isinstance(self.method, BackProjection) and not self._finds_points
@@ -140,7 +149,7 @@ class Plan:
 
     def __call__(self, image: Image, progress: Progress, last: Any = None) -> Result:
         """Reconstruct an image, where the method can do so from `last` of the result of the frame before."""
-        surface = points = statistics = warning = None
+        surface = points = statistics = warning = sieve = None
         if self._finds_points:
             points, statistics, warning = self._find_points(image, progress)
         if self.reconstructor is None:
@@ -151,7 +160,10 @@ class Plan:
         elif self.warm_start:
             volume, last = follow_volume(self.reconstructor, image, last, progress)
         else:
-            volume = self.reconstructor(image, progress)
+            state = self.reconstructor.solve(image, progress)
+            volume = np.asarray(self.reconstructor.finish(state, progress), np.float32)
+            if isinstance(getattr(self.method, "sieve", None), tuple):
+                sieve = float(state.sieve)
         if self.suppress == "clusters":
             from ..detection.particles import find_clusters
 
@@ -163,7 +175,7 @@ class Plan:
 
             with progress.step("Suppressing the background"):
                 volume = suppress(volume, network=self.network)
-        return Result(volume, points, statistics, warning, surface, last)
+        return Result(volume, points, statistics, warning, surface, last, sieve)
 
     def _find_points(self, image: Image, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
         from ..detection.background import subtract_background

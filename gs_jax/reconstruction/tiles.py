@@ -116,6 +116,9 @@ def make_tiles(plan: Plan, side: int | None, jobs: int = 1) -> Tiles:
     if not arrays:
         allowed = "backproject, list-rl, richardson-lucy, fista or admm"
         raise InputError(f"--tiles must be used with {allowed}, got {type(plan.method).__name__}.")
+    sieve = getattr(plan.method, "sieve", None)
+    if isinstance(sieve, float) and sieve > 0:
+        raise InputError("--sieve must not be given with --tiles, got both.")
     margin = 0 if isinstance(plan.method, BackProjection) else _MARGIN
     if side is None:
         memory = available_memory() / jobs - _PROGRAMS - 4 * _IMAGES * math.prod(plan.imager.sensor.shape)
