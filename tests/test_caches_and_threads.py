@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gs_jax.base import caches
-from gs_jax.base.caches import cache_by_value, cached_on_disk
+from gs_jax.base.caches import cache_by_value, cached_on_disk, key_of
 from gs_jax.base.workers import map_in_threads
 
 
@@ -47,6 +47,38 @@ def test_a_damaged_file_is_replaced(folder):
         cached_on_disk([b"x"], compute)
     cached_on_disk([b"x"], compute)
     assert compute.calls == 4
+
+
+def test_arrays_of_a_file_with_any_damaged_byte_are_right(folder):
+    compute = Counted()
+    right = cached_on_disk([b"x"], compute)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    directory = range(whole.index(b"PK\x01\x02"), len(whole))
+    for place in (*range(0, directory.start, 9), *directory):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        read = cached_on_disk([b"x"], compute)
+        assert read.keys() == right.keys() and all(np.array_equal(read[name], right[name]) for name in right)
+    assert compute.calls > len(directory) / 2
+
+
+def test_arrays_of_a_folder_that_cannot_be_written_are_read(monkeypatch):
+    compute = Counted()
+    cached_on_disk([b"x"], compute)
+
+    def refuse(path):
+        raise PermissionError(path)
+
+    monkeypatch.setattr(os, "utime", refuse)
+    cached_on_disk([b"x"], compute)
+    assert compute.calls == 1
+
+
+def test_keys_have_types_shapes_and_numbers():
+    zeros = np.zeros(4), np.zeros((2, 2)), np.zeros(4, np.int64), np.zeros(8, np.float32), np.ones(4), (np.zeros(4),)
+    assert len({tuple(key_of(array)) for array in zeros}) == len(zeros)
+    with pytest.raises(TypeError, match="array or a number"):
+        key_of({"a": object()})
 
 
 def test_nothing_is_kept_where_nothing_can_be_written(tmp_path, monkeypatch):
