@@ -52,6 +52,14 @@ def test_values_derivatives_and_transpose_are_those_of_a_plain_function(compiled
     check_grads(compiled(product), (MATRIX, X), order=1)
 
 
+def test_types_are_those_of_the_precision_that_is_enabled():
+    widest = LinearMap(lambda _, none, x: x.astype(float), lambda _, none, y: y.astype(np.float32))
+    shape = jax.ShapeDtypeStruct((3,), np.float32)
+    for double in (False, True, False):
+        with jax.enable_x64(double):
+            assert jax.eval_shape(lambda x: widest(None, (), x), shape).dtype == (np.float64 if double else np.float32)
+
+
 def test_vmap_over_any_argument():
     def derivatives(f):
         for axes in ((None, 0), (0, None), (0, 0), (2, 1)):

@@ -43,7 +43,8 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
 def compile_at_once(*calls: tuple[Any, tuple]) -> None:
     """Compile jitted functions for arguments, in threads, before they are called: XLA releases Python's lock.
 
-    They are not to be called in threads: programs that run at once may wait for each other for ever on two cores.
+    The threads have JAX's global configuration, not what the caller's context managers set. Compile in threads, but run
+    one program at a time: on two cores, programs that ran in several threads hung (LAPACK's QR in `while` loops).
     """
     for _ in map_in_threads(lambda call: call[0].lower(*call[1]).compile(), calls):
         pass

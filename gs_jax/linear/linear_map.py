@@ -120,12 +120,13 @@ def _run_eagerly(*arrays, call):
 
 @_linear.def_abstract_eval
 def _shapes(*arrays, call):
-    return _shapes_of(call, *(ShapedArray(a.shape, a.dtype) for a in arrays))
+    double: Any = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    return _shapes_of(double, call, *(ShapedArray(a.shape, a.dtype) for a in arrays))
 
 
-# Lowering asks for them again.
+# Lowering asks for them again. Their types depend on `double`.
 @lru_cache(maxsize=256)
-def _shapes_of(call, *arrays):
+def _shapes_of(double, call, *arrays):
     return [ShapedArray(s.shape, s.dtype) for s in jax.eval_shape(call, *arrays)]
 
 

@@ -26,6 +26,8 @@ MAX_SLOPE = math.radians(75)
 _CHORD = 4e-4
 # Rounds that split large facets; one or two are enough.
 _SPLIT_ROUNDS = 20
+# Lenslets end where others hide them, rounded up to such a part of their own radius: alike ones share facets.
+_RADII = 32
 # Radii at which a profile is sampled: to map it, and to estimate its curvature.
 _MAP_SAMPLES, _SAMPLES = 1025, 257
 
@@ -175,7 +177,8 @@ class Part:
         for lenslet, (near, squared) in zip(self.lenslets, neighbourhoods, strict=True):
             distance, edge = np.sqrt(squared), lenslet.semi_aperture
             visible = self.height - lenslet.sag(np.clip(distance - half, 0, edge) ** 2) >= lower_bound[near]
-            radii.append(min(edge, float((distance + half)[visible].max(initial=half))))
+            radius = float((distance + half)[visible].max(initial=half))
+            radii.append(edge * min(math.ceil(_RADII * radius / edge) / _RADII, 1))
         return radii
 
     def facet_count(self, chord: float) -> float:

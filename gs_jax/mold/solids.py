@@ -34,9 +34,6 @@ _OVERCUT = 1.0
 _MIN_WALL_HEIGHT = 1e-5
 # Samples per side of the plate in the volume of unequal lenses.
 _VOLUME_SAMPLES = 1400
-# Lenses that others hide from a radius on are cut there, rounded up to such a part of their own: alike lenses share
-# facets.
-_RADII = 32
 # Facets of a solid that is only drawn.
 _PREVIEW_FACETS = 20_000
 
@@ -105,9 +102,8 @@ def array_solid(part: Part, chord: float = 5e-4, *, progress: Progress | None = 
     bottom, (x, y) = -part.plate_thickness, part.size
     pairs = list(zip(part.lenslets, part.visible_radii, strict=True))
     bodies, alike = [], {}
-    for lenslet, visible in (progress or Progress()).track(pairs, "Tessellating"):
+    for lenslet, radius in (progress or Progress()).track(pairs, "Tessellating"):
         shape = lenslet.semi_aperture, lenslet.radius, lenslet.conic, lenslet.terms
-        radius = lenslet.semi_aperture * min(math.ceil(_RADII * visible / lenslet.semi_aperture) / _RADII, 1)
         if (*shape, radius) not in alike:
             alike[*shape, radius] = _lenslet_body(lenslet, radius, chord, part.height, -bottom / 2)
         bodies.append(alike[*shape, radius].translate([*lenslet.center.tolist(), 0.0]))

@@ -291,7 +291,7 @@ def _trace(points, imager: Imager, progress: Progress | None) -> _FullOptics:
         return tables._asdict() | trace_stray_light(level, lower[::every], grid, cores, _RINGS, progress).arrays()
 
     # The next image of these points by this microscope finds the tables on the disk.
-    arrays = cached_on_disk([b"points", *key_of((level, lower, grid, _RINGS))], trace)
+    arrays = cached_on_disk([b"points", *key_of((level, lower, every, grid, _RINGS))], trace)
     tables = PsfCores(*(arrays.pop(name) for name in PsfCores._fields))
     stray_light = StrayLight.on(grid, **{name: jax.device_put(part) for name, part in arrays.items()})
     return _FullOptics(fine[::every], stray_light, _stamps_of_rings(imager, fine, tables, kernel_size(imager, grid)))

@@ -1,8 +1,8 @@
 """XLA FFI handler, compiled by numba: calls a kernel and splits its work over XLA's thread pool.
 
 XLA calls the handler with a frame (`xla/ffi/api/c_api.h` in jaxlib; the layout is stable within a major version). On
-XLA's own threads nothing waits for a second pool, several programs may run at once, and numba needs no threading layer.
-The calling thread works too, so that the call ends even if no other thread is free.
+XLA's own threads nothing waits for a second pool, and numba needs no threading layer. The calling thread works too, so
+that the call ends even if no other thread is free.
 """
 
 from llvmlite import ir
