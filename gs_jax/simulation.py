@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from threading import Thread
 
 import equinox as eqx
 import jax
@@ -26,7 +25,6 @@ from .base.errors import InputError, input_error, short_repr
 from .base.machine import available_memory
 from .base.progress import Progress
 from .base.typing import Number, PathLike
-from .base.workers import compile_at_once
 from .io.point_tables import read_scene_points
 from .io.volumes import read_volume
 from .microscope.geometry import Imager, check_beyond
@@ -431,11 +429,11 @@ def expose(
     return _expose(image, camera, key, peak_electrons)
 
 
-def compile_exposure(shape: tuple[int, int], camera: Camera, seed: int, peak_electrons: float) -> Thread:
-    """Compile `expose` for images of a shape, float32, in a thread while they are computed; join it before."""
-    call = _expose, (jax.ShapeDtypeStruct(shape, jnp.float32), camera, jax.random.key(seed), peak_electrons)
-    (thread := Thread(target=compile_at_once, args=[call], daemon=True)).start()
-    return thread
+def compile_exposure(shape: tuple[int, int], camera: Camera, peak_electrons: float) -> None:
+    """Compile `expose` for images of a shape, float32, which may be computed meanwhile in another thread."""
+    # A key itself would run a program.
+    image, key = jax.ShapeDtypeStruct(shape, jnp.float32), jax.eval_shape(jax.random.key, 0)
+    _expose.lower(image, camera, key, peak_electrons).compile()
 
 
 @jax.jit

@@ -215,6 +215,8 @@ def simulate_command(
         seed: Seed of the noise.
         output: CAPTURE.tif, .png or .npy.
     """
+    from concurrent.futures import ThreadPoolExecutor
+
     import jax
     import numpy as np
 
@@ -232,16 +234,17 @@ def simulate_command(
     if psf and optics == "full":
         raise InputError(f"--psf {psf} must be used with --optics near, which has one PSF for all lenses.")
     microscope = read_design(design)
-    with Progress() as progress:
+    with Progress() as progress, ThreadPoolExecutor(1) as thread:
         imager = light.imager(microscope)
         camera = Camera(gain, offset, read_noise, math.inf if full_well is None else full_well, bits)
         with errors_name_file(scene):
             objects, grid = _placed(scene, *read_scene(scene), light, imager)
-            compiling = compile_exposure(imager.sensor.shape, camera, seed, peak_electrons) if noise else None
+            exposure = imager.sensor.shape, camera, peak_electrons
+            compiling = thread.submit(compile_exposure, *exposure) if noise else None
             image = simulate(objects, imager, grid, optics=optics, psf=psf, progress=progress)
         if compiling:
             with progress.step("Exposing"):
-                compiling.join()
+                compiling.result()
                 image = np.asarray(expose(image, camera, jax.random.key(seed), peak_electrons=peak_electrons))
         with progress.step("Writing"):
             write_capture(output, image, provenance_of(scene, design=microscope))
