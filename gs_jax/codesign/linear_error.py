@@ -64,7 +64,7 @@ def volume_error(imager: Imager, at: Conditions) -> Float[Array, ""]:
     plate = finite_plate(imager)
     side = jnp.asarray((np.arange(_SQUARES) + 0.5) / _SQUARES - 0.5, plate.dtype)
     positions = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * plate[None]
-    return jnp.sqrt(jnp.mean(lost_power(imager, at, positions)))
+    return jnp.sqrt(jnp.mean(lost_power(imager, at, imager.on_plate(positions))))
 
 
 def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position 2"]) -> Float[Array, " depth"]:
@@ -75,7 +75,7 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
     imager, at
         Lenses of any number of types, and conditions whose depths are the scene's planes.
     positions
-        `(x, y)` of objects, mm; the result is the mean over them. The lenses around each give its parallax.
+        `(x, y)` of objects in the sensor's frame, mm; the result is the mean over them.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     dtype, finest, magnification = at.depths.dtype, 1 / (2 * _EMITTER_SIDE), imager.magnification(at.depths)
@@ -84,8 +84,9 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
     ring = jnp.asarray(weights, dtype) * object_frequency
     frequency = object_frequency / jnp.mean(magnification)
     spectrum = _spectrum(magnification[:, None] * frequency[None])
-    # So far is an object from the farthest lens.
-    widest = jnp.linalg.norm(finite_plate(imager)) * (1 - 1 / (2 * _SQUARES)) / imager.reduced_depth(at.depths[0])
+    # Largest tangent between an object and the farthest lens.
+    farthest = jnp.linalg.norm(finite_plate(imager)) * (1 - 1 / (2 * _SQUARES))
+    widest = farthest / jnp.min(imager.reduced_depth(at.depths))
     tangents = jnp.minimum(widest, _WIDEST) * jnp.linspace(0, 1, _ANGLES, dtype=dtype)
     spots = jax.tree.map(lambda values: of_lenses(imager, values), spots_of_types(imager, at, tangents, frequency))
     views = jax.vmap(lambda position: _view(imager, at, position, tangents, spots.electrons))(positions)
@@ -94,8 +95,8 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
 
     def at_position(position):
         view, noise = position
-        turns = 2 * jnp.pi * jnp.moveaxis(view.turns @ ways, -1, 0)
-        scale = view.on_sensor * view.electrons / (_EMITTER_SIDE**2 * magnification)[None]
+        turns = 2 * jnp.pi * jnp.moveaxis(view.displacement @ ways, -1, 0)
+        scale = safe_sqrt(view.on_sensor) * view.electrons / (_EMITTER_SIDE**2 * magnification)[None]
         power = jnp.einsum("lda,ldaf,df->ldf", view.angles, spots.power, spectrum)
         amplitude = (scale / jnp.sqrt(noise)[:, None])[..., None] * safe_sqrt(power)
 
@@ -120,13 +121,13 @@ class View(NamedTuple):
     """Views of an object at each depth by all lenses.
 
     `electrons`: of an emitter of 40 um x 40 um. `on_sensor`: how much of the square that the object stands for is
-    imaged onto the sensor. `turns`: the image from the lens, mm. `angles`: weights of the angles at which lenses are
+    imaged onto the sensor. `displacement`: of the image from the lens, mm. `angles`: weights of the angles at which lenses are
     evaluated.
     """
 
     electrons: Float[Array, "lens depth"]
     on_sensor: Float[Array, "lens depth"]
-    turns: Float[Array, "lens depth 2"]
+    displacement: Float[Array, "lens depth 2"]
     angles: Float[Array, "lens depth angle"]
 
 
@@ -197,8 +198,11 @@ def spots_of_types(
         On the sensor, 1/mm.
     """
     diameter = clear_diameter(imager, at)
-    points, weights = pupil_quadrature(diameter / 2, _RINGS)
-    # Spots are symmetric about the field's direction, so that the other half of the directions gives the same.
+    # Spots are symmetric about the field's direction, x: half of the rays and of the directions give all.
+    half = [
+        values.reshape(_RINGS, 4 * _RINGS, -1)[:, : 2 * _RINGS] for values in pupil_quadrature(diameter / 2, _RINGS)
+    ]
+    points, weights = half[0].reshape(-1, 2), 2 * half[1].ravel()
     ways = directions(at.depths.dtype)[:, : _DIRECTIONS // 2]
 
     def spot(depth, tangent):
@@ -213,9 +217,12 @@ def spots_of_types(
         total = jnp.sum(light)
         share = light / jnp.where(total > 0, total, 1)
         # Phases are relative to the centroid.
-        from_middle = landing - jnp.sum(share[:, None] * landing, 0)[None]
-        phase = 2 * jnp.pi * frequencies[:, None, None] * (from_middle @ ways)[None]
-        real, imaginary = (jnp.einsum("r,frw->fw", share, wave(phase)) for wave in (jnp.cos, jnp.sin))
+        x, y = landing[:, 0] - jnp.sum(share * landing[:, 0]), landing[:, 1]
+        along, across = (
+            2 * jnp.pi * frequencies[:, None, None] * jnp.outer(*each)[None] for each in zip((x, y), ways, strict=True)
+        )
+        both = share[None, :, None] * jnp.cos(across)
+        real, imaginary = (jnp.sum(both * wave(along), 1) for wave in (jnp.cos, jnp.sin))
         return total, jnp.mean(real**2 + imaginary**2, 1)
 
     total, power = jax.lax.map(lambda depth: jax.vmap(spot, (None, 0))(depth, tangents), at.depths)

@@ -190,7 +190,7 @@ class Imager(eqx.Module):
         Rotation only moves the centres, so the chief-ray map stays separable in x and y in the sensor's frame, which
         makes back-projection fast. So does a tilt, whose `heights` give each lens a magnification of its own.
         """
-        centers = self._in_plane
+        centers = self.on_plate(self.array.centers)
         if self.tilt is None:
             return centers
         cosine = self._cosine
@@ -202,7 +202,7 @@ class Imager(eqx.Module):
         """Heights `(lens,)` of the vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
         if self.tilt is None:
             return array_namespace(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
-        return self._cosine * (self._in_plane @ self.tilt)
+        return self._cosine * (self.on_plate(self.array.centers) @ self.tilt)
 
     def moved(self, origin: Float[Array, "2"]) -> "Imager":
         """The imager with another point `(x, y)` as the origin, mm; depths begin at the array's front there."""
@@ -234,12 +234,11 @@ class Imager(eqx.Module):
             return imager
         return eqx.tree_at(lambda i: i.sample.surface, imager, self.sample.surface - height)
 
-    @property
-    def _in_plane(self):
-        """Lens vertices after rotation and shift, before the tilt."""
+    def on_plate(self, points: Float[Array | np.ndarray, "point 2"]) -> Scalars:
+        """Points `(x, y)` of the array in the sensor's frame, after rotation and shift, before the tilt."""
         xp = array_namespace(self.rotation)
         cos, sin = xp.cos(self.rotation), xp.sin(self.rotation)
-        x, y = self.array.centers.T
+        x, y = points.T
         return xp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + self.shift[None]
 
     @property
