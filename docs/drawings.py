@@ -172,7 +172,7 @@ def field() -> str:
         x, y = c[0] + m * (c[0] - q[0]), c[1] + m * (c[1] - q[1])
         parts.append(dot(x + move, y, 3, "#ffcc80"))
     parts += [
-        text(155, 312, "dark: the lenses that see the point", anchor="middle"),
+        text(155, 312, "dark: the lenses within the field radius", anchor="middle"),
         text(155 + move, 312, "its image: their pattern, s times as large", anchor="middle"),
     ]
     return svg(620, 330, parts)

@@ -1,7 +1,7 @@
 """Sheets fitted to ray-traced captures: depth, focus and volume, beside free voxels and the unrolled inversion.
 
 A tilted snowflake, a curved leaf with veins, a hemisphere with texture, two sheets one behind the other, and blobs,
-which are no sheet, all 9 mm wide, are traced through all lenses of a design onto its whole sensor. Columns: mean and
+which are no sheet, within 9.2 mm, are traced through all lenses of a design onto its whole sensor. Columns: mean and
 standard deviation of the depth's error over lit columns, but steep rims; how many errors are within one predicted
 standard deviation; PSNR above an empty image or volume, blurred by one voxel, of the image in focus and of the volume,
 where the truth has each emitter on its nearest plane, or in linear shares of two; that of the truth's own shares; that

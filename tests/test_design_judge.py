@@ -27,6 +27,7 @@ from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import write_design
+from gs_jax.io.files import write_json
 
 IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0)
 
@@ -93,6 +94,17 @@ def test_records_of_other_settings_are_refused(tmp_path, text, got):
     file.write_text(text)
     with pytest.raises(InputError, match=f"must be of settings .*, got {got}"):
         Judge(file, Settings(), IMAGER)
+
+
+def test_records_of_an_earlier_version_are_refused(tmp_path):
+    settings = Settings(sensor=1.0)
+    judge = Judge(tmp_path / "records.json", settings, IMAGER)
+    judge.kept["found"] = {"geomscope 0": {"letters 0": {"3000": {}}}}
+    write_json(judge.file, judge.kept)
+    with pytest.raises(
+        InputError, match="must have the model's error of each scene, got records of an earlier version"
+    ):
+        Judge(judge.file, settings, IMAGER)
 
 
 @pytest.mark.parametrize(

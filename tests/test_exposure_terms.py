@@ -91,7 +91,7 @@ def test_light_and_blur_far_from_the_axis(orientation):
 
 @pytest.mark.integration
 def test_rays_are_enough_for_wide_spots(monkeypatch):
-    """At 45 degrees and the finest frequencies, whose light is not to be taken for signal: as by twice as many rings."""
+    """At 45 degrees and the finest frequencies, noise of the quadrature is no signal: as by twice as many rings."""
     c, amplitudes = case({}, centers=((0.0, 0.0),)), []
     for rings in (linear_error._RINGS, 80):
         monkeypatch.setattr(linear_error, "_RINGS", rings)

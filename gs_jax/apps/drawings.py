@@ -234,7 +234,7 @@ def plate_and_sensor(imager: Imager) -> tuple[float, float, float, float]:
 
 
 class LensCounts(NamedTuple):
-    """Number of lenses that see each point of a plane within `(left, top, right, bottom)`, mm; mean above the plate."""
+    """Lenses within the field radius of each point of a plane in `(left, top, right, bottom)`, mm; mean over the plate."""
 
     lenses: Int[np.ndarray, "row column"]
     box: tuple[float, float, float, float]

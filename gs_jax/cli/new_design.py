@@ -62,7 +62,7 @@ class DesignOptions(OptionGroup):
         working_distance_mm: NEAR FAR of the object from the plate.
         sensor_distance_mm: Lenses to sensor. [default: thin-lens focus]
         wavelength_nm: Wavelength. [default: 520]
-        field_radius_mm: Field of a lens about its axis. [default: 14 lenses see a point, at most NEAR / 4]
+        field_radius_mm: Field of a lens about its axis. [default: 14 lenses within it, at most NEAR / 4]
     """
 
     pixel_pitch_um: float | None = None

@@ -54,7 +54,7 @@ _WAVELENGTH: Rule = (
 _ROUNDING = 1e-5
 
 # Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a gradient, and
-# so narrow that it adds 5 % to the radius in which lenses see a point.
+# so narrow that it adds 5 % to the radius within which lenses count.
 FALLOFF = 0.1
 
 

@@ -34,7 +34,8 @@ class Conditions(eqx.Module):
     circle_of_confusion
         Diameter of the circle of confusion, mm; two pixels by default.
     exposure
-        Electrons that a mm^2 of clear aperture collects from an emitter of 40 um x 40 um, 20 mm away in air.
+        Electrons that each mm^2 of clear aperture, 20 mm away in air, would collect without losses from an emitter of
+        40 um x 40 um.
     directions
         Number of directions in which the edge of a clear aperture is computed, where lenses differ.
     clear_diameter

@@ -194,9 +194,9 @@ def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
     """Width of the object that at least one lens images onto the sensor, along x and y.
 
-    A lens at `c`, `|c| <= plate/2`, sees a point at `q` within the field radius r whose chief ray lands at
-    `|s c - M q| <= sensor/2`. The outermost such lens, at `c = min(plate/2, sensor/2 + M r)`, sees points up to `c +
-    r`.
+    A lens at `c`, `|c| <= plate/2`, counts for a point at `q` within the field radius r whose chief ray lands at
+    `|s c - M q| <= sensor/2`. The outermost such lens, at `c = min(plate/2, sensor/2 + M r)`, counts for points up to
+    `c + r`.
     """
     at, sensor, plate = as_conditions(imager, depths), imager.sensor, finite_plate(imager)
     half = jnp.array(sensor.shape[::-1], plate.dtype) * (sensor.pixel_pitch / 2)
