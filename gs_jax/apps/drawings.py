@@ -234,7 +234,10 @@ def plate_and_sensor(imager: Imager) -> tuple[float, float, float, float]:
 
 
 class LensCounts(NamedTuple):
-    """Lenses within the field radius of each point of a plane in `(left, top, right, bottom)`, mm; mean over the plate."""
+    """Number of lenses within the field radius of each point of a plane, as `count_lenses` counts; mean above the plate.
+
+    `box`: `(left, top, right, bottom)` of the plane's part, mm.
+    """
 
     lenses: Int[np.ndarray, "row column"]
     box: tuple[float, float, float, float]

@@ -159,7 +159,7 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     with progress.step("Drawing"):
         counts = count_lenses(imager, middle)
         count_map = png_uri(to_uint8(counts.lenses, 0.0, max(float(counts.lenses.max()), 1.0)), "viridis")
-        layout = draw_layout(imager, count_map, counts.box, "the number of lenses within the field radius of each point")
+        layout = draw_layout(imager, count_map, counts.box, "the number of lenses within the field radius")
         section = draw_section(design)
     with progress.step("Spots"):
         diameter = sheet["focal_length_mm"] / sheet["f_number"]

@@ -24,9 +24,9 @@ four designs (`experiments/results/codesign.md`) 5 x 5 objects in place of 3 x 3
 of 14 gave 0.5 to 2 % more, and 80 rings of rays in place of 45 gave at most 0.6 % more. For sparse scenes, solvers with
 a positivity constraint do better than any linear estimate. The paper has no such measure.
 
-An exposure is a time and a brightness, the same for all candidates: the electrons that each mm^2 of clear aperture, 20 mm
-away in air, would collect without losses from an emitter of 40 um x 40 um. So a smaller aperture pays for
-its sharpness with light, and a magnification for its detail.
+An exposure is a time and a brightness, the same for all candidates: the electrons that each mm^2 of clear aperture, 20
+mm away in air, would collect without losses from an emitter of 40 um x 40 um. So a smaller aperture pays for its
+sharpness with light, and a magnification for its detail.
 """
 
 from typing import NamedTuple

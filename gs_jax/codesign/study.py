@@ -161,11 +161,11 @@ class Study(Table):
 
     `margin`: fraction by which targets are tightened during the search, so that the rounded result meets them.
     `exposure`: electrons that each mm^2 of clear aperture, 20 mm away in air, would collect without losses from an
-    emitter of 40 um x 40 um, for terms that count light. `orientation`: side of the lenses toward the object, if it is not the design's. `sample`: of the
-    design's `[samples]`, or "none", the one that holds the object; it becomes that of the new design, and must be given
-    if the design has several and no `[sample]`. `types`: number of lens types (`kinds` in earlier versions, which is
-    still read); lenses that are alike are divided into so many types, with radii spread over the depths, and each type
-    has its own radius, aperture and conic constant.
+    emitter of 40 um x 40 um, for terms that count light. `orientation`: side of the lenses toward the object, if it is
+    not the design's. `sample`: of the design's `[samples]`, or "none", the one that holds the object; it becomes that
+    of the new design, and must be given if the design has several and no `[sample]`. `types`: number of lens types
+    (`kinds` in earlier versions, which is still read); lenses that are alike are divided into so many types, with radii
+    spread over the depths, and each type has its own radius, aperture and conic constant.
     `starts`: number of starts of the first stage; all but the first are random within the bounds, and the best goes on.
     `seed`: of random numbers.
     """

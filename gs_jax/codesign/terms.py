@@ -112,7 +112,9 @@ TERMS: dict[str, Term] = {
     ),
     "coverage": Term("share of the plate that is clear aperture", objectives.coverage),
     "sag_mm": Term("height of a whole lens", objectives.sag),
-    "volume_error": Term("relative error of volumes by the best linear estimate from all lenses, for an exposure", volume_error),
+    "volume_error": Term(
+        "relative error of volumes by the best linear estimate from all lenses, for an exposure", volume_error
+    ),
     "edge_slope_deg": Term("slope at the clear aperture's rim", _scaled(180 / math.pi, objectives.edge_slope)),
     "least_radius_mm": Term("least radius of curvature of a lens's surface", objectives.surface_radius),
 }
