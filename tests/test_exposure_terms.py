@@ -1,4 +1,5 @@
 import dataclasses
+import inspect
 from typing import NamedTuple
 
 import equinox as eqx
@@ -95,7 +96,7 @@ def test_rays_are_enough_for_wide_spots(monkeypatch):
     c, amplitudes = case({}, centers=((0.0, 0.0),)), []
     for rings in (linear_error._RINGS, 80):
         monkeypatch.setattr(linear_error, "_RINGS", rings)
-        spots = jax.jit(lambda *c: spots_of_types.__wrapped__(*c, jnp.ones(1), jnp.linspace(20.0, 45.0, 26)))(*c)
+        spots = jax.jit(lambda *c: inspect.unwrap(spots_of_types)(*c, jnp.ones(1), jnp.linspace(20.0, 45.0, 26)))(*c)
         amplitudes.append(np.sqrt(spots.power))
     # Of 20 rings it is 0.023.
     assert np.sqrt(np.mean((amplitudes[0] - amplitudes[1]) ** 2)) < 0.01

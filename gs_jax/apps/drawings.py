@@ -234,9 +234,9 @@ def plate_and_sensor(imager: Imager) -> tuple[float, float, float, float]:
 
 
 class LensCounts(NamedTuple):
-    """Number of lenses within the field radius of each point of a plane, as `count_lenses` counts; mean above the plate.
+    """Number of lenses within the field radius of each point of a plane, and the mean above the plate.
 
-    `box`: `(left, top, right, bottom)` of the plane's part, mm.
+    `box`: `(left, top, right, bottom)` of these points, mm.
     """
 
     lenses: Int[np.ndarray, "row column"]
