@@ -2,7 +2,7 @@
 
 Beads, letters with bars, tilted sheets and texture are those of `design_judge`; blobs are 24 Gaussian ones of 0.12 to
 0.35 mm and two vessels. All lie within 10 mm by 10 mm by 3.6 mm before the paper's lenses and are ray-traced through
-all of them onto the whole sensor. "dB" is above an empty volume, for a truth that is blurred by a voxel, and in
+all of them onto the whole sensor, of pixels of 10 um. "dB" is above an empty volume, for a truth that is blurred by a voxel, and in
 brackets after the same blur of the volume. Seconds are those of all processors in one call, without tables and
 compilation.
 
@@ -31,7 +31,7 @@ EXPOSURES = (10_000, 1_500, 300)
 # Steps of each method; the unrolled has its own.
 STEPS = {"list-rl": (20,), "richardson-lucy": (5, 10, 20, 40), "unrolled": (20,)}
 RUNS = [(name, steps) for name, all_steps in STEPS.items() for steps in all_steps]
-# 13 planes, 0.3 mm apart, of 40 um voxels; pixels of 10 um, which voxels fill.
+# 13 planes, 0.3 mm apart, of 40 um voxels.
 GRID = gs.Grid(18.2 + 0.3 * np.arange(13), (253, 253), 0.04)
 SENSOR, RAYS = gs.Sensor((2048, 2048), 0.01), 60
 
@@ -75,6 +75,7 @@ def run(kinds: list[str], exposures: list[int], draws: int, progress: gs.Progres
             for name, steps in RUNS:
                 invert = methods[name] if name == "unrolled" else methods[name].by(METHODS[name](steps))
                 if name not in compiled:
+                    # Other numbers of steps run the same programs.
                     compiled.add(name)
                     invert(np.asarray(counts))
                 start = time.process_time()
