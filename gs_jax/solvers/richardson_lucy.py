@@ -176,9 +176,12 @@ class RichardsonLucy(eqx.Module):
 
     def stages(self, count: int) -> "list[RichardsonLucy]":
         """Stages of a solver on so many grids of wider voxels, each twice as narrow as the last, and on its own."""
-        scaled = lambda wide: jax.tree.map(lambda sieve: sieve / 2**wide, self.sieve)
-        solvers = stages(self, count, shares=_SHARES[-1 - count :])
-        return [dataclasses.replace(one, sieve=scaled(count - i)) for i, one in enumerate(solvers)]
+
+        def with_sieve(number, solver):
+            factor = 2 ** (count - number)
+            return dataclasses.replace(solver, sieve=jax.tree.map(lambda sieve: sieve / factor, self.sieve))
+
+        return [with_sieve(*one) for one in enumerate(stages(self, count, shares=_SHARES[-1 - count :]))]
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""
