@@ -74,7 +74,7 @@ def test_a_user_may_begin_on_the_grid_itself(bright_square):
 
     reconstructor.solve(image, Log())
     # Ten by each sieve, and as many more as predict what was held out; then some of those on the grid itself.
-    assert totals[:2] == [10, 10] and totals[-1] == 12 and sum(totals[2:-1]) <= 30
+    assert totals[:2] == [10, 10] and totals[-1] == 15 and sum(totals[2:-1]) <= 30
 
 
 def test_noise_decides_on_the_sieve(bright_square):

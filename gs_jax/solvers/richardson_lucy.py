@@ -43,7 +43,7 @@ _ROUNDING = 100
 # Uniform share of the volume from which the next image of a recording starts.
 _UNIFORM = 0.1
 # Steps on voxels four times and twice as wide, and on those of the volume, relative to `steps`.
-_SHARES = 2, 1.5, 0.6
+_SHARES = 2, 1.5, 0.75
 # Widest sieve, voxels, and the reach of its Gaussian.
 WIDEST_SIEVE, _REACH = 2.0, 6
 # A width that leaves all as it is.
