@@ -31,7 +31,7 @@ from experiments.ray_tracer import traced
 from experiments.surfaces import texture
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
-from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
+from gs_jax.reconstruction.inverse_problem import subtract_offset
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.simulation import letters
 
@@ -193,13 +193,7 @@ class Methods:
     def __init__(self, imager: gs.Imager, settings: Settings):
         self.imager, self.grid, self.settings = imager, settings.grid, settings
         if "richardson-lucy" in settings.methods:
-            self.model = prepare_model(imager, self.grid, "full", gs.Progress())
-            self.problem = InverseProblem(self.model.imager, self.grid, self.model.optics)
-            lucy = METHODS["richardson-lucy"](1)
-            assert isinstance(lucy, gs.RichardsonLucy)
-            self.lucy: gs.RichardsonLucy = lucy
-            self.start = jax.jit(lambda problem, light: lucy.init(problem, light))
-            self.step = jax.jit(lambda problem, light, state: lucy.step(problem, light, state)[0])
+            self.lucy = gs.Reconstructor(imager, self.grid, METHODS["richardson-lucy"](1), wide=False)
         if "unrolled" in settings.methods:
             self.fine = finer(self.grid, settings.width)
             self.unrolled = gs.Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=gs.Progress())
@@ -208,12 +202,11 @@ class Methods:
         """Volume by each method, Richardson-Lucy's with the number of its steps."""
         volumes = {}
         if "richardson-lucy" in self.settings.methods:
-            light, _ = prepare_data(image, self.model)
-            state = self.start(self.problem, light)
+            state = self.lucy.init(image)
             for number in range(1, max(self.settings.steps) + 1):
-                state = self.step(self.problem, light, state)
+                state = self.lucy.step(state)
                 if number in self.settings.steps:
-                    volumes[f"richardson-lucy {number}"] = np.asarray(self.lucy.estimate(state))
+                    volumes[f"richardson-lucy {number}"] = np.asarray(self.lucy.finish(state))
         if "unrolled" in self.settings.methods:
             volumes["unrolled"] = shared(self.unrolled(image, gs.Progress()), self.fine, self.grid)
         return volumes

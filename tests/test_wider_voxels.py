@@ -106,6 +106,16 @@ def test_pixels_that_are_left_out_of_wide_ones_are_not_read(bright_square):
     np.testing.assert_allclose(part(lit), part(image), rtol=1e-5, atol=1e-7)
 
 
+def test_pixels_are_left_out_of_volumes_too_small_for_wide_ones():
+    imager, grid = scene(voxels=(21, 17), pitch=0.14, depths=(18.0, 20.0))
+    reconstructor = gs.Reconstructor(imager, grid, METHODS["richardson-lucy"](4), "pinhole")
+    kept = np.ones(reconstructor.problem.imager.sensor.shape)
+    kept[:, 11:20] = 0
+    part = reconstructor.keeping(kept)
+    assert not part.wider
+    np.testing.assert_array_equal(part.problem.kept, kept)
+
+
 def test_a_background_is_that_of_wide_pixels_on_these(bright_square):
     """A number and an image of narrow pixels are the same."""
     imager, grid, _, image = bright_square

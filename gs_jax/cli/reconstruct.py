@@ -207,7 +207,7 @@ def reconstruct_command(
     if residual:
         click.echo(f"{output}: imaged again it is {format_residual(residual)}")
     if result.sieve is not None:
-        click.echo(f"{output}: --sieve {result.sieve:.3g}, by pixels that were held out")
+        click.echo(f"{output}: --sieve {result.sieve:.3g}, chosen by held-out pixels")
     if predicted:
         click.echo(f"{output}: {predicted}")
     if fit := result.surface:

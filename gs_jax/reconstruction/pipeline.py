@@ -470,7 +470,8 @@ class Reconstructor(eqx.Module):
         for problem in self.wider:
             side = problem.binning // self.problem.binning
             masks.append((sum_pixels(kept, side) == side**2).astype(kept.dtype))
-        where = lambda r: tuple(problem.kept for problem in (r.problem, *r.wider))
+        # Equinox takes an empty tuple for a leaf.
+        where = lambda r: tuple(problem.kept for problem in (r.problem, *(r.wider if self.wider else ())))
         return eqx.tree_at(where, self, tuple(masks), is_leaf=lambda leaf: leaf is None)
 
     def by(self, method: Method) -> "Reconstructor":

@@ -162,7 +162,7 @@ class Plan:
         else:
             state = self.reconstructor.solve(image, progress)
             volume = np.asarray(self.reconstructor.finish(state, progress), np.float32)
-            if isinstance(getattr(self.method, "sieve", None), tuple):
+            if self.reconstructor.wider and isinstance(getattr(self.method, "sieve", None), tuple):
                 sieve = float(state.sieve)
         if self.suppress == "clusters":
             from ..detection.particles import find_clusters
