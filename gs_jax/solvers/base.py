@@ -139,13 +139,18 @@ class Refinement(eqx.Module):
         return self.values(volume) / self.factor**2
 
 
-def stages(solver: Any, count: int, last: Any = None, shares: tuple[float, ...] = _SHARES) -> list[Any]:
-    """Stages of a solver on so many grids of wider voxels and on its own, by default a few of its steps."""
+def stages(
+    solver: Any, count: int, last: Any = None, shares: tuple[float, ...] = _SHARES, least: tuple[int, ...] = (1, 1, 1)
+) -> list[Any]:
+    """Stages of a solver on so many grids of wider voxels and on its own, by default a few of its steps.
 
-    def taking(share):
-        return dataclasses.replace(solver, steps=math.ceil(share * solver.steps))
-
-    return [*(taking(share) for share in shares[:count]), taking(shares[-1]) if last is None else last]
+    Each stage has a share of the steps, and takes at least so many.
+    """
+    every = [
+        dataclasses.replace(solver, steps=max(math.ceil(share * solver.steps), fewest))
+        for share, fewest in zip(shares, least, strict=True)
+    ]
+    return [*every[:count], every[-1] if last is None else last]
 
 
 class RESULTS(eqx.Enumeration):

@@ -44,6 +44,8 @@ _ROUNDING = 100
 _UNIFORM = 0.1
 # Steps on voxels four times and twice as wide, and on those of the volume, relative to `steps`.
 _SHARES = 2, 1.5, 0.75
+# Steps that are taken at least: on wide voxels they cost little, and find the depth.
+_LEAST_STEPS = 24, 8, 1
 # Widest sieve, voxels, and the reach of its Gaussian.
 WIDEST_SIEVE, _REACH = 2.0, 6
 # A width that leaves all as it is.
@@ -181,7 +183,10 @@ class RichardsonLucy(eqx.Module):
             factor = 2 ** (count - number)
             return dataclasses.replace(solver, sieve=jax.tree.map(lambda sieve: sieve / factor, self.sieve))
 
-        return [with_sieve(*one) for one in enumerate(stages(self, count, shares=_SHARES[-1 - count :]))]
+        return [
+            with_sieve(*one)
+            for one in enumerate(stages(self, count, shares=_SHARES[-1 - count :], least=_LEAST_STEPS[-1 - count :]))
+        ]
 
     def refined(self, A: Operator, image: Float[Array, "..."], state: State, refinement: Refinement) -> State:
         """The state on narrower voxels; it goes on with the same momentum."""
