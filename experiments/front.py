@@ -6,7 +6,7 @@ ray-traced through all of them onto the whole sensor, in pixels of 20 um. Voxels
 default, and 13 planes. "dB" is above an empty volume, for a truth that is blurred by half a voxel. Seconds are of a
 processor, of one call, without tables and compilation.
 
-    python -m experiments.front [--kinds blobs,texture] [--exposures 40000,1200] [--draws 3] [--records FILE] [--out DIR]
+    python -m experiments.front [--kinds blobs,texture] [--exposures 40000,1200] [--draws 3] [--records FILE]
 
 An exposure is the number of electrons in the brightest pixel. Writes the records after each image, from which the next
 run goes on, then `front.json`, `front.md` and `front.png`; an hour and a half of a core for all.
