@@ -17,6 +17,7 @@ from ..base.errors import InputError
 from ..base.machine import describe
 from ..base.progress import Progress
 from ..base.typing import Image, PathLike, Points
+from ..codesign.bound import bound_sheet, format_bound
 from ..design.datasheets import TABLES, datasheet, findings, overview, summary, tables, violations
 from ..design.design import Design, design_text, span_of
 from ..io.files import check_output, read_text, write_text
@@ -154,6 +155,7 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     with progress.step("Datasheet"):
         sheet = datasheet(design)
         remarks, faults = findings(design, sheet), violations(design, sheet)
+        bound = format_bound(bound_sheet(design.imager(), sheet["depth_mm"]), len(sheet["depth_mm"]))
     imager, depths = design.imager(), np.array(sheet["depth_mm"])
     middle = float(depths[len(depths) // 2])
     with progress.step("Drawing"):
@@ -178,7 +180,7 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
             _cells(*both, faults) for both in zip(tables(sheet), chain(TABLES.values(), repeat(())), strict=False)
         ],
         "violations": remarks,
-        "device": [summary(design, sheet), *overview(design, sheet)],
+        "device": [summary(design, sheet), *overview(design, sheet), bound],
         "keys": _device_rows(design),
         "section": section,
         "layout": layout,

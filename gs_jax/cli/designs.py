@@ -54,6 +54,7 @@ def metrics_command(
     json: Path | None = None,
     depths: DepthList | None = None,
     confusion_um: Um | None = None,
+    bound: bool = False,
     light: Light,
 ):
     """Show what the microscope of DESIGN resolves (the paper's Eqs. 1-11, and exact rays), in five lines.
@@ -66,6 +67,7 @@ def metrics_command(
         json: Also write the numbers to this file.
         depths: START:STOP:STEP in mm. [default: seven in the working distance]
         confusion_um: Diameter of the circle of confusion, um. [default: two pixels]
+        bound: Also compare the error of volumes with the least that any lenses on this plate could have.
     """
     from rich.console import Console
 
@@ -79,12 +81,18 @@ def metrics_command(
     if depths:
         check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
+    if bound:
+        from ..codesign.bound import bound_sheet, format_bound
+
+        sheet["bound"] = bound_sheet(microscope.imager(), sheet["depth_mm"])
     if json:
         write_json(json, sheet)
     click.echo(summary(microscope, sheet))
     click.echo(f"  {objects_in(microscope.imager())}; {_calibration(microscope.provenance)}")
     for line in overview(microscope, sheet, circle_of_confusion=circle_of_confusion):
         click.echo(f"  {line}")
+    if bound:
+        click.echo(f"  {format_bound(sheet['bound'], len(sheet['depth_mm']))}")
     problems = findings(microscope, sheet, circle_of_confusion=circle_of_confusion)
     if verbosity.get() != VERBOSE:
         click.echo(f"  tables by depth and {plural(len(problems), 'remark')}: --verbose")

@@ -44,7 +44,7 @@ from ..optics.pupil import pupil_quadrature, solid_angle, transmittance
 from ..optics.raytrace import refract
 
 # Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
-_FILL, _LENGTH = 0.03, 0.05
+FILL, _LENGTH = 0.03, 0.05
 # Read noise, electrons.
 _READ_NOISE = 2.0
 # Nodes of the quadrature over frequencies, up to Nyquist of voxels of 40 um.
@@ -54,7 +54,7 @@ _SQUARES = 3
 # Angles at which a lens is evaluated, and the largest tangent of these.
 _ANGLES, _WIDEST = 14, 1.2
 # Distance and side of the emitter that an exposure is defined by, mm.
-_EMITTER_DISTANCE, _EMITTER_SIDE = 20.0, 0.04
+EMITTER_DISTANCE, EMITTER_SIDE = 20.0, 0.04
 # Rings of rays: enough at the largest tangent and the finest frequencies, where fewer alias.
 _RINGS = 45
 # Directions of frequencies over half a turn.
@@ -63,10 +63,7 @@ _DIRECTIONS = 4
 
 def volume_error(imager: Imager, at: Conditions) -> Float[Array, ""]:
     """Relative error of volumes by the best linear estimate: the root of the mean of `lost_power` over the depths."""
-    plate = finite_plate(imager)
-    side = jnp.asarray((np.arange(_SQUARES) + 0.5) / _SQUARES - 0.5, plate.dtype)
-    positions = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * plate[None]
-    return jnp.sqrt(jnp.mean(lost_power(imager, at, imager.on_plate(positions))))
+    return jnp.sqrt(jnp.mean(lost_power(imager, at, imager.on_plate(plate_positions(imager)))))
 
 
 def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position 2"]) -> Float[Array, " depth"]:
@@ -79,28 +76,12 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
     positions
         `(x, y)` of objects in the sensor's frame, mm; the result is the mean over them.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    dtype, finest, magnification = at.depths.dtype, 1 / (2 * _EMITTER_SIDE), imager.magnification(at.depths)
-    # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
-    object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
-    ring = jnp.asarray(weights, dtype) * object_frequency
-    frequency = object_frequency / jnp.mean(magnification)
-    spectrum = _spectrum(magnification[:, None] * frequency[None])
-    # Largest tangent between an object and the farthest lens.
-    farthest = jnp.linalg.norm(finite_plate(imager)) * (1 - 1 / (2 * _SQUARES))
-    widest = farthest / jnp.min(imager.reduced_depth(at.depths))
-    tangents = jnp.minimum(widest, _WIDEST) * jnp.linspace(0, 1, _ANGLES, dtype=dtype)
-    spots = jax.tree.map(lambda values: of_lenses(imager, values), spots_of_types(imager, at, tangents, frequency))
-    views = jax.vmap(lambda position: _view(imager, at, position, tangents, spots.electrons))(positions)
-    noise = noise_density(imager, at, views)
-    ways, planes = directions(dtype), jnp.eye(at.depths.size, dtype=dtype)
+    scene = scene_of(imager, at)
+    views, spots = views_and_spots(imager, at, positions, scene)
+    noise, planes = noise_density(imager, at, views), jnp.eye(at.depths.size, dtype=at.depths.dtype)
 
     def at_position(position):
-        view, noise = position
-        turns = 2 * jnp.pi * jnp.moveaxis(view.displacement @ ways, -1, 0)
-        scale = safe_sqrt(view.on_sensor) * view.electrons / (_EMITTER_SIDE**2 * magnification)[None]
-        power = jnp.einsum("lda,ldaf,df->ldf", view.angles, spots.power, spectrum)
-        amplitude = (scale / jnp.sqrt(noise)[:, None])[..., None] * safe_sqrt(power)
+        amplitude, turns = images(imager, at, scene, spots, *position)
 
         def at_frequency(frequency, amplitude):
             cos, sin = (amplitude[None] * wave(frequency * turns) for wave in (jnp.cos, jnp.sin))
@@ -112,11 +93,62 @@ def lost_power(imager: Imager, at: Conditions, positions: Float[Array, "position
             left = jnp.diagonal(jnp.linalg.inv(normal), axis1=1, axis2=2)
             return jnp.mean(left[:, : len(planes)], 0)
 
-        return jax.vmap(at_frequency, (0, 2), 1)(frequency, amplitude)
+        return jax.vmap(at_frequency, (0, 2), 1)(scene.frequency, amplitude)
 
-    left = jnp.mean(jax.lax.map(at_position, (views, noise)), 0)
-    share = ring[None] * spectrum
-    return jnp.sum(left * share, 1) / jnp.sum(share, 1)
+    return jnp.sum(jnp.mean(jax.lax.map(at_position, (views, noise)), 0) * scene.share, 1)
+
+
+def plate_positions(imager: Imager) -> Float[Array, "position 2"]:
+    """Middles of squares that divide the plate, `(x, y)` in the plate's frame, mm."""
+    plate = finite_plate(imager)
+    side = jnp.asarray((np.arange(_SQUARES) + 0.5) / _SQUARES - 0.5, plate.dtype)
+    return jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * plate[None]
+
+
+class Scene(NamedTuple):
+    """Random planes by frequencies of the sensor, 1/mm.
+
+    `spectrum`: power of the objects' brightness, mm^2. `share`: share of a plane's power.
+    """
+
+    frequency: Float[Array, " frequency"]
+    spectrum: Float[Array, "depth frequency"]
+    share: Float[Array, "depth frequency"]
+
+
+def scene_of(imager: Imager, at: Conditions) -> Scene:
+    """The scene of `volume_error`, a plane at each depth."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    dtype, finest, magnification = at.depths.dtype, 1 / (2 * EMITTER_SIDE), imager.magnification(at.depths)
+    # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
+    object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
+    frequency = object_frequency / jnp.mean(magnification)
+    spectrum = _spectrum(magnification[:, None] * frequency[None])
+    share = (jnp.asarray(weights, dtype) * object_frequency)[None] * spectrum
+    return Scene(frequency, spectrum, share / jnp.sum(share, 1, keepdims=True))
+
+
+def views_and_spots(
+    imager: Imager, at: Conditions, positions: Float[Array, "position 2"], scene: Scene
+) -> tuple["View", "Spots"]:
+    """Views of objects at positions, and the spots of each lens at the angles of its views."""
+    # Largest tangent between an object and the farthest lens.
+    farthest = jnp.linalg.norm(finite_plate(imager)) * (1 - 1 / (2 * _SQUARES))
+    widest = farthest / jnp.min(imager.reduced_depth(at.depths))
+    tangents = jnp.minimum(widest, _WIDEST) * jnp.linspace(0, 1, _ANGLES, dtype=at.depths.dtype)
+    spots = spots_of_types(imager, at, tangents, scene.frequency)
+    spots = jax.tree.map(lambda values: of_lenses(imager, values), spots)
+    return jax.vmap(lambda position: _view(imager, at, position, tangents, spots.electrons))(positions), spots
+
+
+def images(
+    imager: Imager, at: Conditions, scene: Scene, spots: "Spots", view: "View", noise: Float[Array, " lens"]
+) -> tuple[Float[Array, "lens depth frequency"], Float[Array, "direction lens depth"]]:
+    """Amplitudes of the planes in the sub-images of an object over their noise, and phases over the frequency."""
+    turns = 2 * jnp.pi * jnp.moveaxis(view.displacement @ directions(at.depths.dtype), -1, 0)
+    scale = safe_sqrt(view.on_sensor) * view.electrons / (EMITTER_SIDE**2 * imager.magnification(at.depths))[None]
+    power = jnp.einsum("lda,ldaf,df->ldf", view.angles, spots.power, scene.spectrum)
+    return (scale / jnp.sqrt(noise)[:, None])[..., None] * safe_sqrt(power), turns
 
 
 class View(NamedTuple):
@@ -159,12 +191,12 @@ def noise_density(imager: Imager, at: Conditions, views: View) -> Float[Array, "
     # All light that reaches the sensor from planes as large as the plate.
     whole = jnp.mean(jnp.sum(views.on_sensor * views.electrons, (1, 2))) * jnp.prod(finite_plate(imager))
     over = whole / (sensor.shape[0] * sensor.shape[1] * sensor.pixel_pitch**2)
-    return _FILL / _EMITTER_SIDE**2 * (own + over) + (_READ_NOISE / sensor.pixel_pitch) ** 2
+    return FILL / EMITTER_SIDE**2 * (own + over) + (_READ_NOISE / sensor.pixel_pitch) ** 2
 
 
 def _spectrum(frequency):
     """Power spectrum of random objects with edges, whose correlation falls exponentially (Debye), mm^2."""
-    return _FILL * (1 - _FILL) * 2 * jnp.pi * _LENGTH**2 / (1 + (2 * jnp.pi * _LENGTH * frequency) ** 2) ** 1.5
+    return FILL * (1 - FILL) * 2 * jnp.pi * _LENGTH**2 / (1 + (2 * jnp.pi * _LENGTH * frequency) ** 2) ** 1.5
 
 
 def directions(dtype) -> Float[Array, "2 direction"]:
@@ -228,7 +260,7 @@ def spots_of_types(
         return total, jnp.mean(real**2 + imaginary**2, 1)
 
     total, power = jax.lax.map(lambda depth: jax.vmap(spot, (None, 0))(depth, tangents), at.depths)
-    electrons = at.exposure.astype(total.dtype) * _EMITTER_DISTANCE**2 * (jnp.pi / 4 * diameter**2) * total
+    electrons = at.exposure.astype(total.dtype) * EMITTER_DISTANCE**2 * (jnp.pi / 4 * diameter**2) * total
     cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
     others = theory.ideal_mtf(frequencies, cutoff) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
     return Spots(electrons, power * (others**2)[None, None])
