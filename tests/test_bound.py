@@ -1,6 +1,7 @@
 """The bound on linear estimates against closed forms, and designs against the bound."""
 
 import dataclasses
+import json
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.codesign.bound import _unexplained, bound_sheet, lost_by_any
+from gs_jax.codesign.bound import EXPOSURES, _unexplained, bound_sheet, format_bound, lost_by_any
 from gs_jax.codesign.linear_error import FILL, Scene, _spectrum, directions, scene_of
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
@@ -98,3 +99,13 @@ def test_no_design_exceeds_it(name):
     own, most = np.array(sheet["design_db"]), np.array(sheet["most_db"])
     assert (0 < own).all() and (own < most).all()
     assert (np.diff(own) > 0).all() and (np.diff(most) > 0).all()
+
+
+@pytest.mark.integration
+def test_the_command_says_a_designs_share(tmp_path, run):
+    status, out, _ = run("metrics", "endoscope", "--bound", "--json", tmp_path / "sheet.json")
+    sheet = json.loads((tmp_path / "sheet.json").read_text())["bound"]
+    assert status == 0 and format_bound(sheet, 7) in out
+    assert sheet["exposure"] == list(EXPOSURES)
+    shares = [round(100 * own / most) for own, most in zip(sheet["design_db"], sheet["most_db"], strict=True)]
+    assert "the design has {} / {} / {} % of that".format(*shares) in out
