@@ -72,6 +72,7 @@ def metrics_command(
     from rich.console import Console
 
     from ..base.progress import VERBOSE, verbosity
+    from ..codesign.bound import bound_sheet, format_bound
     from ..design.datasheets import datasheet, findings, overview, summary, tables
     from ..microscope.geometry import check_beyond
 
@@ -82,8 +83,6 @@ def metrics_command(
         check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
     if bound:
-        from ..codesign.bound import bound_sheet, format_bound
-
         sheet["bound"] = bound_sheet(microscope.imager(), sheet["depth_mm"])
     if json:
         write_json(json, sheet)

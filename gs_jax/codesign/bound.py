@@ -101,7 +101,7 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     return VolumeBound(_gain(_lost_by_design(imager, at)), _gain(lost_by_any(imager, at)))
 
 
-def bound_sheet(imager: Imager, depths: Sequence[float]) -> dict[str, list[float]]:
+def bound_sheet(imager: Imager, depths: Depths) -> dict[str, list[float]]:
     """`volume_bound` at three exposures, as numbers for a datasheet."""
     at = as_conditions(imager, depths)
     gains = _at_exposures(imager, at, jnp.asarray(EXPOSURES, at.depths.dtype))
