@@ -71,7 +71,6 @@ Better designs, and their molds:
     optimize             Search for the imager of the least loss
     free                 Which numbers of an imager a search may change
     objectives           Derived quantities of an imager at depths (Eqs. 4-11), for datasheets and searches
-    volume_bound         What a linear estimate of a volume gains, and a bound for any lenses on the same plate
     run_study            Search for a design that does what a study wants
     read_study           The study in a TOML file
     make_mold            Writes the mold of a design, or the array, for printing, with a picture and a report

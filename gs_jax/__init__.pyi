@@ -4,7 +4,6 @@ from .apps.pictures import show as show
 from .base.errors import InputError as InputError
 from .base.progress import Progress as Progress
 from .calibration.fit import calibrate as calibrate
-from .codesign.bound import volume_bound as volume_bound
 from .codesign.parameters import free as free
 from .codesign.search import run_study as run_study
 from .codesign.solve import optimize as optimize

@@ -93,7 +93,8 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
 
     Examples
     --------
-    >>> bound = gs.volume_bound(gs.geomscope().imager(), np.linspace(18, 23, 7))
+    >>> from gs_jax.codesign.bound import volume_bound
+    >>> bound = volume_bound(gs.geomscope().imager(), np.linspace(18, 23, 7))
     >>> print(f"{bound.design:.0f} of {bound.most:.0f} dB")
     19 of 28 dB
     """
