@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from gs_jax.codesign.bound import EXPOSURES, _unexplained, bound_sheet, format_bound, lost_by_any
 from gs_jax.codesign.linear_error import FILL, Scene, _spectrum, directions, scene_of
@@ -79,16 +78,6 @@ def test_more_light_and_a_larger_plate_bound_less():
         for plate in ([0.8, 0.5], [0.8, 1.5], [3.0, 1.5])
     ]
     assert (np.diff(gains, axis=0) < 0).all() and (np.diff(gains, axis=1) < 0).all()
-
-
-@pytest.mark.integration
-def test_gradients():
-    """By the plate, the light and a depth."""
-
-    def mean(plate, exposure, depth):
-        return jnp.mean(lost(plate, Conditions(jnp.stack([18.0 * depth, 18.5 * depth, 21.0]), exposure=exposure)))
-
-    check_grads(mean, (jnp.array([0.8, 0.5]), jnp.array(1e3), jnp.array(1.0)), order=1, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.integration

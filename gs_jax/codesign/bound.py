@@ -65,7 +65,7 @@ class VolumeBound(NamedTuple):
 def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     """What a linear estimate of a volume gains over an empty one, and a bound for any lenses on the same plate.
 
-    *Differentiable.*
+    *Compiled.*
 
     Scenes are random planes at the depths, as wide as the plate, independent of each other, of objects with edges that
     fill 3 %. The bound depends on the size of the plate, the depths, the object's medium and the exposure. Each ray
