@@ -131,7 +131,7 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path.write_bytes(b"{}\n")
     with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
-    path.write_bytes(b'{"format": "gs-jax checkpoint 5", "of": "", "log": {"steps": 1, "ends": 2}}\n')
+    path.write_bytes(b'{"format": "gs-jax checkpoint 6", "of": "", "log": {"steps": 1, "ends": 2}}\n')
     with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
     interrupted(table1, study(), path, monkeypatch, writes=1)

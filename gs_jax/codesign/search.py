@@ -52,7 +52,9 @@ from .terms import TERMS, Objective, Term, evaluate, with_terms
 
 # Seconds between two checkpoints.
 _EVERY = 10.0
-_FORMAT = "gs-jax checkpoint 5"
+_FORMAT = "gs-jax checkpoint 6"
+# A start ends when its least cost has fallen by no more than this part of itself in so many steps; Adam's oscillates.
+_FLAT, _FLAT_STEPS = 1e-4, (20, 100)
 
 
 class Problem(NamedTuple):
@@ -140,7 +142,9 @@ class Stage(NamedTuple):
         objectives = tuple(Objective(TERMS[term.name], term.kind, term.target, term.weight) for term in terms)
         residuals = Residuals(imager, at, values, _transforms_of(study, number), objectives, study.margin)
         key = jax.random.fold_in(jax.random.key(study.seed), number)
-        stepper = Stepper(residuals, solver_of(table), key)
+        # Costs of random terms differ from step to step, flat or not.
+        flat = None if any(objective.term.random for objective in objectives) else as_float(_FLAT)
+        stepper = Stepper(residuals, solver_of(table), key, flat, _FLAT_STEPS[table.solver == "adam"])
         return cls(number, table, terms, labels(terms, study), residuals, stepper, _enough(problem, terms, values))
 
     def worst(self, free: Values) -> list[float]:
@@ -346,8 +350,9 @@ def run_study(
 
     *Host.*
 
-    A search has converged when its solver has, or when the cost has changed by less than a millionth of itself over 20
-    steps, in double precision (`jax_enable_x64`). In single precision it stops far from the minimum.
+    A start ends when all targets are met (unless there is a goal), when its solver has converged, or when its least
+    cost has fallen by less than 0.01 % in 20 steps, with Adam in 100; but with random terms at the limit of steps. Use
+    double precision (`jax_enable_x64`): single stops far from the minimum.
 
     Parameters
     ----------

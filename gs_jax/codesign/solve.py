@@ -31,6 +31,7 @@ Residual = Callable[[PyTree, Key[Array, ""]], Float[Array, "..."]]
 
 CONVERGED = "converged: the cost does not change any more"
 MET = "all targets are met"
+FLAT = "stopped: the least cost has fallen by less than {:g} % in {} steps"
 LIMIT = "stopped at the limit of {} steps"
 NOT_FINITE = "stopped: the cost or a parameter is not finite"
 
@@ -174,7 +175,10 @@ def solver_of(stage: StageTable) -> Solver:
 
 
 class State(NamedTuple):
-    """State of a search: all that its next step depends on, arrays only. `recent`: the last costs, oldest first."""
+    """State of a search: all that its next step depends on, arrays only.
+
+    `recent`: the last costs, oldest first; if the `Stepper` has `flat`, the least until each of the last steps.
+    """
 
     free: PyTree[Array]
     solver: PyTree
@@ -204,18 +208,23 @@ class Stepper(eqx.Module):
         begin with steps of nearly no length. Random residuals, which get a new key in each step, do not converge.
     key
         From which the keys of the steps follow.
+    flat
+        The run ends instead when the least cost so far has fallen by no more than this part of itself over `window`
+        steps, with any solver. Not for random residuals.
     """
 
     residual: Residual
     solver: Any = eqx.field(converter=_as_solver)
     key: Key[Array, ""]
+    flat: Float[Array, ""] | None = None
+    window: int = eqx.field(static=True, default=_FLAT_STEPS)
 
     @eqx.filter_jit
     def begin(self, free: PyTree[Array]) -> State:
         """The state at free variables."""
         function, cost = self._functions(free)
         value, inner = cost(free, self.key), eqx.filter(self._init(function, free, self.key), eqx.is_array)
-        state = State(free, inner, value, jnp.broadcast_to(value, _FLAT_STEPS + 1), jnp.array(0), jnp.array(False))
+        state = State(free, inner, value, jnp.broadcast_to(value, self.window + 1), jnp.array(0), jnp.array(False))
         # Without weak types, which a step would take from it: it would be compiled again.
         return jax.tree.map(lambda x: x.astype(x.dtype), state)
 
@@ -232,11 +241,16 @@ class Stepper(eqx.Module):
         done, result = self.solver.terminate(function, free, key, {}, inner, frozenset())
         is_optax = isinstance(self.solver, optx.OptaxMinimiser)
         value, step = cost(free, key), state.step + 1
-        recent = jnp.append(state.recent[1:], value)
-        tolerance = least_change() if is_optax else _flat_change()
-        flat = (jnp.ptp(recent) <= tolerance * jnp.max(jnp.abs(recent))) & (step >= _FLAT_STEPS)
-        converged = flat | ((done | (result != optx.RESULTS.successful)) & (not is_optax))
+        # With `flat`, the least so far.
+        recent = jnp.append(state.recent[1:], value if self.flat is None else jnp.minimum(state.recent[-1], value))
+        converged = self.is_flat(recent, step) | ((done | (result != optx.RESULTS.successful)) & (not is_optax))
         return State(free, eqx.filter(inner, eqx.is_array), value, recent, step, converged)
+
+    def is_flat(self, recent: Float[Array, " recent"], step: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether the recent costs of a state differ by no more than the tolerance."""
+        is_optax = isinstance(self.solver, optx.OptaxMinimiser)
+        tolerance = (least_change() if is_optax else _flat_change()) if self.flat is None else self.flat
+        return (jnp.ptp(recent) <= tolerance * jnp.max(jnp.abs(recent))) & (step >= self.window)
 
     def _functions(self, free):
         """The function that the solver takes, which has nothing to return beside its value; and the cost."""
@@ -287,6 +301,8 @@ def run(
         if float(state.cost) < enough:
             return state, MET
         if state.converged:
+            if stepper.flat is not None and stepper.is_flat(state.recent, state.step):
+                return state, FLAT.format(100 * float(stepper.flat), stepper.window)
             return state, CONVERGED
         if int(state.step) >= limit:
             return state, LIMIT.format(limit)
