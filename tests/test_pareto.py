@@ -100,16 +100,19 @@ def test_a_looser_limit_has_no_worse_design(monkeypatch):
     assert [float(point.values["aperture_diameter_mm"]) for point in found.points] == [0.2, 0.2, 0.1]
     assert light[0] == light[1] > light[2] > 0 and depth[0] == depth[1] < depth[2]
     assert [point.limits for point in found.points] == [(3.0,), (6.0,), (12.0,)] and found.best.all()
-    # The others start from the first, then each from the best neighbour that keeps its limit.
-    assert starts[1:] == [(6.0, 0.15), (12.0, 0.15), (3.0, 0.2), (6.0, 0.15), (12.0, 0.2)]
+    # All start from the design; then each from the one before it, and on the way back from the one after it.
+    assert {start for _, start in starts[:3]} == {2.0} and [limit for limit, _ in starts[:3]] == [3.0, 6.0, 12.0]
+    assert starts[3:] == [(6.0, 0.15), (12.0, 0.2), (6.0, 0.1), (3.0, 0.2)]
 
 
 def test_neighbours_differ_by_one_step_of_one_limit():
     """Whatever their order in the file."""
     combinations = list(itertools.product((2.0, 8.0, 5.0), (0.1, 0.2)))
-    near = [{combinations[other] for other in others} for others in pareto._neighbours(combinations)]
+    neighbours, ranks = pareto._neighbours(combinations)
+    near = [{combinations[other] for other in others} for others in neighbours]
+    assert ranks.tolist() == [0, 1, 2, 3, 1, 2]
     assert near[0] == {(2.0, 0.2), (5.0, 0.1)} and near[-1] == {(5.0, 0.1), (2.0, 0.2), (8.0, 0.2)}
-    assert pareto._neighbours([(1.0,)]) == [[]]
+    assert pareto._neighbours([(1.0,)])[0] == [[]]
 
 
 # Focus by the distance of the sensor; then the widest lens with that depth of field.

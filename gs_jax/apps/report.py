@@ -119,6 +119,7 @@ def write_report(
         "notes": dict.fromkeys(("page", "capture", "volume", "points"), "") | dict(notes or {}),
         "colors": {name: color_table(name) for name in ("magma", "viridis")},
         "tolerance": tolerance and tolerance_section(tolerance),
+        "limits": limits if isinstance(limits := design.provenance.get("limits"), dict) else {},
         **_calibration(design),
         **_origins(design, provenance, origins or {}),
         **_optics(design, progress),

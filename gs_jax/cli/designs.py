@@ -178,8 +178,9 @@ def optimize_command(
 ):
     """Search for a better microscope than that of the file DESIGN, and compare both.
 
-    NEW.toml.json (the terms, every start and step) and NEW.toml.png (layout and history) are written beside it. Workers
-    run the starts of the study's first stage.
+    The first design that meets all targets is written at once. The table at the end says what the goal changes by with
+    each limit. NEW.toml.json (the terms, every start and step) and NEW.toml.png (layout and history) are written beside
+    it. Workers run the starts of the study's first stage.
 
     Options:
         study: STUDY.toml: free parameters, goals and solvers.
@@ -190,10 +191,11 @@ def optimize_command(
     from rich.console import Console
 
     from ..codesign import search
-    from ..codesign.search_report import before_and_after, side_files, write_outcome
+    from ..codesign.search_report import before_and_after, side_files, write_first, write_outcome
     from ..codesign.terms import add_terms
 
-    check_outputs(output, [".toml"], *side_files(output), inputs=(design, study, terms), force=force)
+    # An interrupted run may have left its first design.
+    check_outputs(output, [".toml"], *side_files(output), inputs=(design, study, terms), force=force or resume)
     # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
     checkpoint = checkpoint_path(output, resume=resume)
@@ -202,10 +204,17 @@ def optimize_command(
     if terms:
         add_terms(terms)
     partial_outputs[checkpoint] = RESUMABLE
+    files = {"parent": design, "source": study, "provenance": provenance_of(design, study, terms)}
+
+    def first(found):
+        write_first(output, found, **files)
+        partial_outputs[output] = PARTIAL
+        click.echo(f"{output}: the first design that meets all targets; the search goes on")
+
     with Progress() as progress, workers:
         options = {"progress": progress, "checkpoint": checkpoint, "resume": resume, "workers": workers}
-        outcome = search.run_study(design, study, **options)
-    write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study, terms))
+        outcome = search.run_study(design, study, first=first, **options)
+    write_outcome(output, outcome, **files)
     checkpoint.unlink(missing_ok=True)
     Console().print(before_and_after(outcome))
     for end in outcome.log.ends:

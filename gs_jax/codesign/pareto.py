@@ -2,14 +2,15 @@
 
 By the epsilon-constraint method (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971) one term is
 minimised or maximised under limits on one or two others, which move from value to value. Each search is that of
-`gs_jax.codesign.search`. The first starts from the design, the others from its result; then each limit is searched once
-more from the best design of a neighbouring limit. The searches of a round may run in parallel. A point is the best of
-all designs found that keep its limits, so a looser limit never has a worse one. The true front may be better.
+`gs_jax.codesign.search`. Each limit is searched from the study's start, then from the best design of the limits before
+it, and on the way back from that of the limits after it; the better result stays. Searches that do not wait for each
+other may run in parallel. A point is the best of all designs found that keep its limits, so none is dominated by a
+neighbour's. The true front may be better.
 """
 
 import contextlib
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -77,11 +78,12 @@ class Sweep(NamedTuple):
         moved = [t.model_copy(update={t.kind: limit}) for t, limit in zip(self.moving, limits, strict=True)]
         return [*self.kept, *moved]
 
-    def search(self, limits: Sequence[float], values: Values) -> Point:
+    def search(self, limits: Sequence[float], values: Values, starts: int) -> Point:
         """The point of a search under limits, or that of its start if it comes to no number."""
         terms = self.terms(limits)
+        problem = self.problem._replace(study=self.problem.study.model_copy(update={"starts": starts}))
         with contextlib.suppress(InputError):
-            values = run_stages(self.problem, terms, values, log=Log())
+            values = run_stages(problem, terms, values, log=Log())
         return Point(values, self.problem.rows(terms, values), tuple(limits))
 
     def under(self, point: Point, limits: tuple[float, ...]) -> Point:
@@ -172,7 +174,8 @@ def trade_off(
 def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress, workers: Workers) -> Front:
     problem = sweep.problem
     combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
-    neighbours = _neighbours(combinations)
+    # Combinations of one rank have no neighbours among them.
+    neighbours, ranks = _neighbours(combinations)
     names, points = [term.name for term in problem.study.terms], {}
     stream = workers.mapper(with_terms(partial(_searcher, sweep), names))
 
@@ -184,41 +187,43 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
             points[number] = new
             each(front())
 
-    def from_neighbours():
-        # The starts depend on the first round alone, so that the order in which workers finish does not matter.
-        first = dict(points)
-        for number, limits in enumerate(combinations):
-            if near := [sweep.under(first[other], limits) for other in neighbours[number]]:
-                yield number, limits, min(near, key=sweep.rank).values
+    def from_neighbours(rank: int, step: int) -> Iterator[tuple[int, tuple[float, ...], Values, int]]:
+        """The searches of a rank, each from the best design of its neighbours one rank back."""
+        for number in np.flatnonzero(ranks == rank).tolist():
+            limits = combinations[number]
+            near = [sweep.under(points[n], limits) for n in neighbours[number] if ranks[n] == rank - step]
+            yield number, limits, min(near, key=sweep.rank).values, 1
 
-    with progress.counter("Trade-off", len(combinations) + sum(map(bool, neighbours))) as advance:
+    upwards = sorted(set(ranks.tolist()))
+    passes = [(rank, 1) for rank in upwards[1:]] + [(rank, -1) for rank in upwards[-2::-1]]
+    with progress.counter("Trade-off", 3 * len(combinations) - 2) as advance:
         values = start_values(problem.imager, problem.at)
         warn_of_start(problem, values)
-        for some in (combinations[:1], combinations[1:]):
-            first = len(points)
-            for (number, *_), result in stream((first + i, limits, values) for i, limits in enumerate(some)):
-                points[number] = result()
-                each(front())
-                advance()
-            values = points[0].values
-        for (number, *_), result in stream(list(from_neighbours())):
-            keep_better(number, result())
+        jobs = [(number, limits, values, problem.study.starts) for number, limits in enumerate(combinations)]
+        for (number, *_), result in stream(jobs):
+            points[number] = result()
+            each(front())
             advance()
+        for rank, step in passes:
+            # What starts them depends on other ranks alone, so the order in which workers finish does not matter.
+            for (number, *_), result in stream(list(from_neighbours(rank, step))):
+                keep_better(number, result())
+                advance()
     for number, limits in enumerate(combinations):
         keep_better(number, min((sweep.under(point, limits) for point in points.values()), key=sweep.rank))
     return front()
 
 
-def _searcher(sweep: Sweep) -> Callable[[tuple[int, Sequence[float], Values]], Point]:
-    """From the number of a point, its limits and where to start, to the point; for a worker."""
+def _searcher(sweep: Sweep) -> Callable[[tuple[int, Sequence[float], Values, int]], Point]:
+    """From the number of a point, its limits, where to start and the number of starts, to the point; for a worker."""
     return lambda job: sweep.search(*job[1:])
 
 
-def _neighbours(combinations: list[tuple[float, ...]]) -> list[list[int]]:
-    """For each combination of limits, those that are next to it along one axis."""
+def _neighbours(combinations: list[tuple[float, ...]]) -> tuple[list[list[int]], np.ndarray]:
+    """For each combination of limits, those next to it along one axis, and its rank: its steps from the lowest."""
     axes = [sorted(set(axis)) for axis in zip(*combinations, strict=True)]
     index = np.array([[axis.index(limit) for axis, limit in zip(axes, some, strict=True)] for some in combinations])
-    return [np.flatnonzero(np.abs(index - own).sum(1) == 1).tolist() for own in index]
+    return [np.flatnonzero(np.abs(index - own).sum(1) == 1).tolist() for own in index], index.sum(1)
 
 
 def as_json(front: Front) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from ..design.design import Design, read_design
 from ..io.files import atomic_write, check_input, decoding
 from ..microscope.geometry import Imager
 from ..objectives.conditions import Conditions
+from .limits import Limit, Residuals, limits_of
 from .parameters import Values, candidate, evaluated, new_design, start_values
 from .solve import (
     NOT_FINITE,
@@ -41,7 +42,6 @@ from .solve import (
     State,
     Stepper,
     Transforms,
-    forward,
     inverse,
     run,
     solver_of,
@@ -97,26 +97,9 @@ def _entries(
     return [evaluate(term, *new, key) for term in terms]
 
 
-class Residuals(eqx.Module):
-    """Residuals of a study's terms as a function of a solver's variables; every number is a leaf.
-
-    `values`: parameters, of which those that have no transform stay.
-    """
-
-    imager: Imager
-    at: Conditions
-    values: Values
-    transforms: Transforms
-    objectives: tuple[Objective, ...]
-    margin: Float[Array, ""] = eqx.field(converter=as_float)
-
-    def parameters(self, free: Values) -> Values:
-        """All parameters, by the solver's variables."""
-        return self.values | forward(self.transforms, free)
-
-    def __call__(self, free: Values, key: Key[Array, ""]) -> Float[Array, " entry"]:
-        new = candidate(self.imager, self.at, self.parameters(free))
-        return jnp.concatenate([objective.residual(*new, key, margin=self.margin) for objective in self.objectives])
+# Called with the state of a search, None after a start that a worker ran, and with parameters that meet the stage's
+# targets, or None.
+Each = Callable[[State | None, Values | None], None]
 
 
 class Stage(NamedTuple):
@@ -138,7 +121,7 @@ class Stage(NamedTuple):
         """A stage of a study, with the targets of its terms and the parameters that do not move."""
         imager, at, study = problem
         table = study.stages[number]
-        terms = [term for term in terms if table.terms is None or term.name in table.terms]
+        terms = table.of(terms)
         objectives = tuple(Objective(TERMS[term.name], term.kind, term.target, term.weight) for term in terms)
         residuals = Residuals(imager, at, values, _transforms_of(study, number), objectives, study.margin)
         key = jax.random.fold_in(jax.random.key(study.seed), number)
@@ -158,23 +141,26 @@ class Stage(NamedTuple):
         """The state at parameters."""
         return self.stepper.begin(inverse(self.residuals.transforms, values))
 
-    def run(self, start: int, state: State, steps: list[dict[str, Any]], each: Callable[[State], None]):
+    def run(self, start: int, state: State, steps: list[dict[str, Any]], each: "Each"):
         """Run a start from its state, add a record for each step, and return that of its end."""
+
+        def meets(worst: list[float]) -> bool:
+            return all(term.assess([x]).met is not False for term, x in zip(self.terms, worst, strict=True))
 
         def after_step(state):
             record = {"stage": self.number, "start": start, "step": int(state.step), "cost": float(state.cost)}
-            steps.append(record | dict(zip(self.labels, self.worst(state.free), strict=True)))
-            each(state)
+            worst = self.worst(state.free)
+            steps.append(record | dict(zip(self.labels, worst, strict=True)))
+            each(state, self.residuals.parameters(state.free) if meets(worst) else None)
 
         state, reason = run(self.stepper, state, limit=self.table.steps, enough=self.enough, each=after_step)
         reached = self.residuals.parameters(state.free)
-        worst = zip(self.terms, self.worst(state.free), strict=True)
         return {
             "stage": self.number,
             "start": start,
             "steps": int(state.step),
             "cost": float(state.cost),
-            "met": all(term.assess([x]).met is not False for term, x in worst),
+            "met": meets(self.worst(state.free)),
             "reason": reason,
             "free": {name: np.asarray(reached[name]).tolist() for name in state.free},
         }
@@ -233,7 +219,7 @@ def run_stages(
     *,
     log: Log,
     progress: Progress | None = None,
-    each: Callable[[State | None], None] = lambda state: None,
+    each: Each = lambda state, values: None,
     saved: tuple[Path, bytes] | None = None,
     workers: Workers | None = None,
 ) -> Values:
@@ -248,7 +234,7 @@ def run_stages(
     log
         Steps and ends are added to it. A start that it has the end of is not run again.
     each
-        Called after every step with the state; with None after every start that a worker ran.
+        Called after every step, and after every start that a worker ran.
     saved
         Saved state of the first start that has not ended.
     workers
@@ -273,7 +259,7 @@ def run_stages(
                     steps, end = result()
                     log.steps.extend(steps)
                     log.ends.append(end)
-                    each(None)
+                    each(None, _reached(end, values) if end["met"] else None)
                     advance()
             else:
                 stage = Stage.of(problem, number, terms, values)
@@ -286,9 +272,13 @@ def run_stages(
         # Workers finish in any order.
         for records in (log.steps, log.ends):
             records.sort(key=lambda record: (record["stage"], record["start"]))
-        best = log.best_end(number)["free"]
-        values = values | {name: jnp.asarray(x, values[name].dtype) for name, x in best.items()}
+        values = _reached(log.best_end(number), values)
     return values
+
+
+def _reached(end: dict[str, Any], values: Values) -> Values:
+    """The parameters of a start's end."""
+    return values | {name: jnp.asarray(x, values[name].dtype) for name, x in end["free"].items()}
 
 
 def _runner(problem, terms, values):
@@ -297,7 +287,7 @@ def _runner(problem, terms, values):
 
     def run_alone(start):
         steps = []
-        end = stage.run(start, stage.begin(problem.start(values, start)), steps, lambda state: None)
+        end = stage.run(start, stage.begin(problem.start(values, start)), steps, lambda state, values: None)
         return steps, end
 
     return run_alone
@@ -307,7 +297,8 @@ class Outcome(NamedTuple):
     """Result of a search.
 
     `parent`, `study`: its inputs. `design`: the new one, with the study's name. `before`, `after`: one row for each
-    of the study's terms. `log`: of every start and step. `seconds`: of the search, compilation included.
+    of the study's terms. `limits`: what the optimum of the last stage changes by with each limit. `log`: of every start
+    and step. `seconds`: of the search, compilation included.
     """
 
     parent: Design
@@ -315,6 +306,7 @@ class Outcome(NamedTuple):
     design: Design
     before: list[Row]
     after: list[Row]
+    limits: list[Limit]
     log: Log
     seconds: float
 
@@ -345,6 +337,7 @@ def run_study(
     resume: bool = False,
     every: float = _EVERY,
     workers: Workers | None = None,
+    first: Callable[[Design], None] | None = None,
 ) -> Outcome:
     """Search for a design that does what a study wants.
 
@@ -370,6 +363,8 @@ def run_study(
         Seconds between two checkpoints.
     workers
         Processes that run the first stage's starts; this one by default. The result is the same.
+    first
+        Called once, with the first design that meets all targets, while the search goes on.
 
     Raises
     ------
@@ -412,12 +407,30 @@ def run_study(
         values = start_values(problem.imager, problem.at)
         warn_of_start(problem, values)
         before = problem.rows(question.terms, values)
-        options = {"log": log, "progress": progress, "each": save, "saved": saved, "workers": workers}
+        written = partial(_written, parent, problem)
+        waits = [] if first is None else [first]
+
+        def each(state: State | None, met: Values | None) -> None:
+            save(state)
+            if waits and met is not None:
+                design, rows = written(met)
+                if all(row.met is not False for row in rows):
+                    waits.pop()(design)
+
+        options = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
         values = run_stages(problem, question.terms, values, **options)
-        new = new_design(parent, problem.imager, problem.at, values).model_copy(update={"name": question.name})
-        written = problem_of(new, question.model_copy(update={"depths_mm": None}))
-        after = written.rows(question.terms, start_values(written.imager, written.at))
-        return Outcome(parent, question, new, before, after, log, time.monotonic() - began)
+        design, after = written(values)
+        last = Stage.of(problem, len(question.stages) - 1, question.terms, values)
+        limits = limits_of(last.residuals, last.terms, question, values, last.stepper.key)
+        return Outcome(parent, question, design, before, after, limits, log, time.monotonic() - began)
+
+
+def _written(parent: Design, problem: Problem, values: Values) -> tuple[Design, list[Row]]:
+    """The design of parameters as its file has it, with the study's name, and its terms."""
+    study = problem.study
+    new = new_design(parent, problem.imager, problem.at, values).model_copy(update={"name": study.name})
+    rounded = problem_of(new, study.model_copy(update={"depths_mm": None}))
+    return new, rounded.rows(study.terms, start_values(rounded.imager, rounded.at))
 
 
 class _Saver:

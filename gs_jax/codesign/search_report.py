@@ -21,9 +21,10 @@ from ..io.provenance import Provenance
 from ..microscope.layouts import plate_corners
 from ..microscope.lenses import lenses_by_type
 from ..optics.raytrace import to_numpy
+from .limits import Limit
 from .parameters import significant
 from .search import Outcome
-from .study import Row, TermTable, labels
+from .study import Row, TermTable, labels, only_goal
 from .terms import SIGNS, TERMS, unit_of
 
 # As `gs_jax.apps.pictures`.
@@ -31,13 +32,29 @@ PALETTE = color_sequences["petroff10"]
 
 
 def before_and_after(outcome: Outcome) -> Table:
-    """Table of the study's terms before and after."""
-    table = Table("term", "target", "before", "after", "", box=None, pad_edge=False)
+    """Table of the study's terms before and after and of bounds that bind, and what the goal changes by with each."""
+    slopes, goal = limit_texts(outcome), only_goal(outcome.study.stages[-1].of(outcome.study.terms))
+    heads = ["term", "target", "before", "after", "", *([f"{goal.name} by the limit"] if goal else [])]
+    table = Table(*heads, box=None, pad_edge=False)
     for term, old, new in zip(outcome.study.terms, outcome.before, outcome.after, strict=True):
-        table.add_row(
-            term.name, target_text(term), span(old), span(new), {True: "met", False: "MISSED", None: ""}[new.met]
-        )
+        met, target = {True: "met", False: "MISSED", None: ""}[new.met], target_text(term)
+        row = term.name, target, span(old), span(new), met, slopes.pop(f"{term.name} {target}", "")
+        table.add_row(*row[: len(heads)])
+    for limit, slope in slopes.items():
+        table.add_row(*limit.split(" ", 1), "", "", "bound", slope)
     return table
+
+
+def limit_texts(outcome: Outcome) -> dict[str, str]:
+    """What the goal changes by per unit of each limit, with units, or that it does not bind, by the limit as text."""
+    goal = only_goal(outcome.study.stages[-1].of(outcome.study.terms))
+    unit = unit_of(goal.name) if goal else ""
+
+    def text(limit: Limit) -> str:
+        per = unit_of(limit.name).removesuffix("s") or "1"
+        return f"{limit.slope:+.3g} {unit} per {per}".replace("  ", " ") if limit.slope else "does not bind"
+
+    return {f"{limit.name} {SIGNS[limit.kind]} {limit.value:g}": text(limit) for limit in outcome.limits}
 
 
 def target_text(term: TermTable) -> str:
@@ -72,20 +89,32 @@ def write_outcome(
     """
     path, study, records = Path(path), outcome.study, as_records(outcome)
     paths = [path, *side_files(path)]
+    limits = [limit._asdict() | {"slope": six_digits(limit.slope)} for limit in outcome.limits]
     history = {"starts": list(map(_plain, outcome.log.ends)), "steps": list(map(_plain, outcome.log.steps))}
-    write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
+    write_json(
+        paths[1],
+        {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records, "limits": limits} | history,
+    )
     write_figure(paths[2], picture(outcome))
-    table = {
-        **(provenance or {}),
-        "parent": Path(parent).name,
-        "study": Path(source).name,
-        "seed": study.seed,
-        "date": datetime.date.today().isoformat(),
-        "reason": outcome.log.best_end(len(study.stages) - 1)["reason"],
-        "objectives": {record["term"]: record["after"] for record in records if None not in record["after"]},
-    }
+    reason = outcome.log.best_end(len(study.stages) - 1)["reason"]
+    table = origin(parent=parent, source=source, reason=reason, provenance=provenance)
+    table |= {"seed": study.seed}
+    table["objectives"] = {record["term"]: record["after"] for record in records if None not in record["after"]}
+    table |= {"limits": texts} if (texts := limit_texts(outcome)) else {}
     write_design(paths[0], outcome.design.model_copy(update={"provenance": table}))
     return paths
+
+
+def write_first(path: PathLike, design: Design, **of: Any) -> None:
+    """Write the first design that meets all targets of a study; `of` as `origin`, without a reason."""
+    reason = "the first that meets all targets; the search had not ended"
+    write_design(path, design.model_copy(update={"provenance": origin(reason=reason, **of)}))
+
+
+def origin(*, parent: PathLike, source: PathLike, reason: str, provenance: Provenance | None = None) -> dict[str, Any]:
+    """Provenance of a design that a search found: the files of the old design and of the study, and why it ended."""
+    own = {"parent": Path(parent).name, "study": Path(source).name}
+    return {**(provenance or {}), **own, "date": datetime.date.today().isoformat(), "reason": reason}
 
 
 def as_records(outcome: Outcome) -> list[dict[str, Any]]:

@@ -128,6 +128,10 @@ class StageTable(Table):
     free: tuple[str, ...] | None = Field(default=None, strict=False, description="names of parameters in [free]")
     terms: tuple[TermName, ...] | None = Field(default=None, strict=False, description="names of terms in [[terms]]")
 
+    def of(self, terms: Sequence[TermTable]) -> list[TermTable]:
+        """The terms that the stage looks at."""
+        return [term for term in terms if self.terms is None or term.name in self.terms]
+
 
 class LimitTable(Table):
     """`[[pareto]]`: a term with a list of limits, each with a weight of 30.
@@ -199,6 +203,12 @@ class Study(Table):
         for check in (_check_free, _check_terms, _check_stages, _check_pareto):
             check(self)
         return self
+
+
+def only_goal(terms: Sequence[TermTable]) -> TermTable | None:
+    """The one term that is minimised or maximised; None if there are several or none."""
+    goals = [term for term in terms if term.is_goal]
+    return goals[0] if len(goals) == 1 else None
 
 
 def labels(terms: Sequence[TermTable], study: Study) -> list[str]:
