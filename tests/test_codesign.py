@@ -1,12 +1,14 @@
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import search
+from gs_jax.codesign.limits import limits_of
 from gs_jax.codesign.parameters import start_values
-from gs_jax.codesign.search import Log, problem_of, read_checkpoint, run_study
+from gs_jax.codesign.search import Log, Stage, problem_of, read_checkpoint, run_study
 from gs_jax.codesign.search_report import before_and_after, picture, write_outcome
 from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.study import Study, read_study
@@ -142,6 +144,23 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path.write_bytes(whole)
     with pytest.raises(InputError, match="of another study or design"):
         run_study(table1, study(seed=1), checkpoint=path, resume=True)
+
+
+@pytest.mark.parametrize("kind, bound, at", [("minimise", "at_least", 2.0), ("maximise", "at_most", 6.0)])
+def test_a_bound_that_binds(table1, kind, bound, at):
+    """The thickness goes with the sensor's distance; nothing binds within the range."""
+    question = study(free={"sensor_distance_mm": [2.0, 6.0]}, terms=[{"name": "thickness_mm", kind: 5.0}])
+    problem = problem_of(table1, question)
+    values = start_values(problem.imager, problem.at)
+    stage = Stage.of(problem, 0, question.terms, values)
+
+    def limits(distance):
+        moved = values | {"sensor_distance_mm": jnp.asarray(distance)}
+        return limits_of(stage.residuals, stage.terms, question, moved, stage.stepper.key)
+
+    assert limits(4.0) == []
+    (limit,) = limits(at)
+    assert limit[:3] == ("sensor_distance_mm", bound, at) and limit.slope == pytest.approx(1)
 
 
 def test_random_starts(table1):

@@ -68,7 +68,17 @@ def test_optimize(folder, own_terms):
     assert result.exit_code == 0 and "thickness_mm" in result.output and "from geomscope in" in result.output
     distance = read_design("new.toml").imaging.sensor_distance_mm
     assert 1 <= distance / (4.5 / 40 * (23 + 1 / 1.43)) < 1.01
-    assert json.loads((folder / "new.toml.json").read_text())["terms"][1]["met_after"] is True
+    numbers = json.loads((folder / "new.toml.json").read_text())
+    assert numbers["terms"][1]["met_after"] is True
+    # The distance goes as one over the resolution: its derivative by that limit, by hand.
+    resolution, own = numbers["limits"]
+    assert resolution["slope"] == pytest.approx(-distance / 40, rel=0.01) and own["slope"] == 0
+    shown = read_design("new.toml").provenance["limits"]
+    assert shown == {
+        "lateral_resolution_um <= 40": f"{resolution['slope']:+.3g} mm per um",
+        "own_mm <= 9": "does not bind",
+    }
+    assert "thickness_mm by the limit" in result.output and "the first design that meets all targets" in result.output
     assert "input own.py" in read_provenance(folder / "new.toml")
     assert (folder / "new.toml.png").exists() and not (folder / "new.toml.checkpoint").exists()
 

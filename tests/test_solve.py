@@ -11,6 +11,7 @@ from scipy.optimize import least_squares, minimize
 
 from gs_jax.codesign.solve import (
     CONVERGED,
+    FLAT,
     LIMIT,
     MET,
     NOT_FINITE,
@@ -108,6 +109,17 @@ def test_a_cost_that_is_flat_has_converged(residual, solver):
     state, reason = run(steps, steps.begin({"x": jnp.array(1.5)}), limit=200, each=note)
     assert reason == CONVERGED and int(state.step) == len(costs) < 100
     assert costs[-1] == pytest.approx(0.5, rel=1e-6) and np.ptp(costs[-21:]) <= 1e-6 * 0.5 < np.ptp(costs[-22:])
+
+
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+def test_the_least_cost_is_flat(solver):
+    """By a stated part in a stated number of steps, whether the solver has converged or not."""
+    steps = Stepper(falling, solver_of(StageTable(solver=solver)), KEY, jnp.asarray(0.01), 20)
+    least = []
+    note = lambda state: least.append(min([float(state.cost), *least]))
+    _, reason = run(steps, steps.begin({"x": jnp.array(3.0)}), limit=200, each=note)
+    assert reason == FLAT.format(1, 20) == "stopped: the least cost has fallen by less than 1 % in 20 steps"
+    assert len(least) == 20 and least[0] - least[-1] <= 0.01 * least[0]
 
 
 def test_damping_falls_until_it_suits_the_curvature():
