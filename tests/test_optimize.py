@@ -78,7 +78,7 @@ def test_optimize(folder, own_terms):
         "lateral_resolution_um <= 40": f"{resolution['slope']:+.3g} mm per um",
         "own_mm <= 9": "does not bind",
     }
-    assert "thickness_mm by the limit" in result.output and "the first design that meets all targets" in result.output
+    assert "goal per" in result.output and "the first design that meets all targets" in result.output
     assert "input own.py" in read_provenance(folder / "new.toml")
     assert (folder / "new.toml.png").exists() and not (folder / "new.toml.checkpoint").exists()
 
