@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
-from rich.table import Table
+from rich.table import Column, Table
 
 from ..base.typing import PathLike
 from ..design.datasheets import six_digits
@@ -34,7 +34,7 @@ PALETTE = color_sequences["petroff10"]
 def before_and_after(outcome: Outcome) -> Table:
     """Table of the study's terms before and after and of bounds that bind, and what the goal changes by with each."""
     slopes, goal = limit_texts(outcome), only_goal(outcome.study.stages[-1].of(outcome.study.terms))
-    heads = ["term", "target", "before", "after", "", *(["goal per limit"] if goal else [])]
+    heads = [Column("term", no_wrap=True), "target", "before", "after", "", *(["goal per limit"] if goal else [])]
     table = Table(*heads, box=None, pad_edge=False)
     for term, old, new in zip(outcome.study.terms, outcome.before, outcome.after, strict=True):
         met, target = {True: "met", False: "MISSED", None: ""}[new.met], target_text(term)
