@@ -40,7 +40,8 @@ from gs_jax.optics.psf_core import (
 )
 from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
-from gs_jax.projection.field_varying_model import wider_voxels
+from gs_jax.projection import field_varying_model
+from gs_jax.projection.field_varying_model import wider_voxels, window_sides
 from gs_jax.projection.point_sources import full_image_of_points, full_imager_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
@@ -93,6 +94,35 @@ def test_it_holds_the_light_that_rays_bring(point):
     one = Grid([point[2]], (1, 1), 0.1, point[:2])
     image = forward(jnp.full((1, 1, 1), 2.0), scope, one, field_varying_psf(scope, one.depths))
     np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
+
+
+def test_windows_hold_the_image_of_the_whole_sensor(monkeypatch):
+    """Of plain and of oriented rings on both kinds of pixels, in lenses that are partly beyond the sensor, too."""
+    scope, voxels = imager(), grid()
+    monkeypatch.setattr(field_varying_model, "_FEW", math.inf)
+    table, rng = field_varying_psf(scope, voxels.depths), np.random.default_rng(0)
+    monkeypatch.setattr(field_varying_model, "_WINDOWS", 4)
+    assert min(sides := window_sides(scope, voxels, table)) > 0
+    waves = [rng.normal(size=(2, 1, 4, *kernels.shape[-2:])) for kernels in (table.kernels, table.wide_kernels)]
+    whole = dataclasses.replace(table, harmonics=waves[0], wide_harmonics=waves[1])
+
+    @jax.jit
+    def results(x, optics):
+        """The image, its derivative by the sensor's distance, and the adjoint's volume of it."""
+
+        def image(distance, x):
+            return forward(x, eqx.tree_at(lambda i: i.sensor_distance, scope, distance), voxels, optics)
+
+        y, slope = jax.jvp(lambda d: image(d, x), [scope.sensor_distance], [jnp.ones_like(scope.sensor_distance)])
+        return y, slope, jax.vjp(image, scope.sensor_distance, x)[1](y)
+
+    x = volume(voxels.volume_shape)
+    wanted, found = (results(x, dataclasses.replace(whole, windows=windows)) for windows in ((0, 0), sides))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
+    np.testing.assert_allclose(jnp.vdot(found[2][1], x), jnp.vdot(found[0], found[0]), rtol=1e-12)
+    # Images that do not fit into their windows are no images.
+    assert np.isnan(forward(x, scope, voxels, dataclasses.replace(table, windows=(16, 16)))).any()
 
 
 ALSO = pytest.mark.integration

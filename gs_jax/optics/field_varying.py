@@ -248,7 +248,8 @@ class FieldVaryingPsf(eqx.Module):
     the inner rings, on the sensor's pixels, with the sum 1. `wide_kernels`: of the outer rings, on pixels twice as
     large. `harmonics` and `wide_harmonics`: the kernels of `cos t`, `sin t`, `cos 2t` and `sin 2t` for those of the
     rings that have them, which are the last; `t` is the angle from the field's direction (`PsfCores`). `rings`: outer
-    radii of the rings, in field radii.
+    radii of the rings, in field radii. `windows`: sides of the squares of pixels, of inner and outer rings, in which
+    each lens shows all voxels of a small grid, or 0; set by `psf_model`.
     """
 
     distortion: Float[Array, "depth ring"]
@@ -259,6 +260,7 @@ class FieldVaryingPsf(eqx.Module):
     wide_harmonics: Float[Array, "depth wide_oriented wave small small"]
     stray_light: StrayLight
     rings: tuple[float, ...] = eqx.field(static=True)
+    windows: tuple[int, int] = eqx.field(static=True, default=(0, 0))
 
 
 def field_varying_psf(

@@ -1,5 +1,6 @@
 """The forward model, Eq. (2): the image of a volume, with PSF models of three fidelities."""
 
+import dataclasses
 import math
 import operator
 from functools import reduce
@@ -22,7 +23,7 @@ from ..optics.field_varying import FieldVaryingPsf, field_varying_psf, make_pola
 from ..optics.psf import PSFS, psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
 from .convolution import sum_of_convolutions, with_margin
-from .field_varying_model import full_image
+from .field_varying_model import full_image, window_sides
 
 FIDELITIES = ("full", "near", "pinhole")
 # Depths that share an inverse FFT, which takes the memory of as many sharp images.
@@ -131,7 +132,11 @@ def psf_model(
         # The sensor is as wide as most objects, whose tables then have the same nodes.
         extent = max(2 * max(map(abs, imager.sensor.extent)), extent_of(grid))
         nodes = make_polar_grid(imager, depths, extent=extent, coarser=coarser)
-        parts = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in imagers]
+        tables = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in imagers]
+        parts = [
+            dataclasses.replace(table, windows=window_sides(one, grid, table))
+            for one, table in zip(imagers, tables, strict=True)
+        ]
     else:
         areas = relative_areas(imagers).tolist() if len(imagers) > 1 else [1.0]
         parts = [area * field_constant_psf(one) for one, area in zip(imagers, areas, strict=True)]
