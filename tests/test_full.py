@@ -108,19 +108,19 @@ def test_windows_hold_the_image_of_the_whole_sensor(monkeypatch):
 
     @jax.jit
     def results(x, optics):
-        """The image, its derivative by the sensor's distance, and the adjoint's volume of it."""
+        """The image, the gradient by the sensor's distance, and the adjoint's volume of it."""
 
         def image(distance, x):
             return forward(x, eqx.tree_at(lambda i: i.sensor_distance, scope, distance), voxels, optics)
 
-        y, slope = jax.jvp(lambda d: image(d, x), [scope.sensor_distance], [jnp.ones_like(scope.sensor_distance)])
-        return y, slope, jax.vjp(image, scope.sensor_distance, x)[1](y)
+        y, back = jax.vjp(image, scope.sensor_distance, x)
+        return y, *back(y)
 
     x = volume(voxels.volume_shape)
     wanted, found = (results(x, dataclasses.replace(whole, windows=windows)) for windows in ((0, 0), sides))
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
-    np.testing.assert_allclose(jnp.vdot(found[2][1], x), jnp.vdot(found[0], found[0]), rtol=1e-12)
+    np.testing.assert_allclose(jnp.vdot(found[2], x), jnp.vdot(found[0], found[0]), rtol=1e-12)
     # Images that do not fit into their windows are no images.
     assert np.isnan(forward(x, scope, voxels, dataclasses.replace(table, windows=(16, 16)))).any()
 
