@@ -31,7 +31,7 @@ from experiments.ray_tracer import traced
 from experiments.surfaces import texture
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
-from gs_jax.reconstruction.inverse_problem import subtract_offset
+from gs_jax.reconstruction.inverse_problem import subtract_offset, sum_pixels
 from gs_jax.reconstruction.pipeline import METHODS
 from gs_jax.simulation import letters
 
@@ -40,6 +40,8 @@ DESIGNS = ("geomscope", "geomscope-optimized", "geomscope-asphere")
 KINDS = ("letters", "beads", "tilted sheets", "texture")
 IN_PLANES = KINDS[:2]
 VOXEL, PLANE, READ_NOISE = 0.04, 0.3, 2.0
+# Steps of Richardson-Lucy, the default of `gs-jax reconstruct`.
+STEPS = 20
 # Distance of emitters, of which so many share rays, mm; and squares of a scene that the bootstrap draws, along a side.
 APART, TILE, SQUARES = 0.01, 0.1, 3
 # How images are made; records of others are refused.
@@ -64,7 +66,6 @@ class Settings(NamedTuple):
     kinds: tuple[str, ...] = KINDS
     exposures: tuple[int, ...] = (20_000, 3_000, 500)
     methods: tuple[str, ...] = ("richardson-lucy", "unrolled")
-    steps: tuple[int, ...] = (3, 6, 12)
     rays: int = 1_200
     width: float = 1.0
     images: str = "rays"
@@ -193,23 +194,28 @@ class Methods:
     def __init__(self, imager: gs.Imager, settings: Settings):
         self.imager, self.grid, self.settings = imager, settings.grid, settings
         if "richardson-lucy" in settings.methods:
-            self.lucy = gs.Reconstructor(imager, self.grid, METHODS["richardson-lucy"](1), wide=False)
+            self.lucy = gs.Reconstructor(imager, self.grid, METHODS["richardson-lucy"](STEPS))
         if "unrolled" in settings.methods:
             self.fine = finer(self.grid, settings.width)
             self.unrolled = gs.Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=gs.Progress())
 
     def volumes(self, image: np.ndarray) -> dict[str, np.ndarray]:
-        """Volume by each method, Richardson-Lucy's with the number of its steps."""
+        """Volume by each method."""
         volumes = {}
         if "richardson-lucy" in self.settings.methods:
-            state = self.lucy.init(image)
-            for number in range(1, max(self.settings.steps) + 1):
-                state = self.lucy.step(state)
-                if number in self.settings.steps:
-                    volumes[f"richardson-lucy {number}"] = np.asarray(self.lucy.finish(state))
+            volumes["richardson-lucy"] = self.lucy(image)
         if "unrolled" in self.settings.methods:
             volumes["unrolled"] = shared(self.unrolled(image, gs.Progress()), self.fine, self.grid)
         return volumes
+
+    def model_error(self, scene: Scene, clean: np.ndarray) -> float:
+        """Error of the methods' image of a scene, after the best gain, relative to a clean image on the same pixels."""
+        problem = (self.unrolled if "unrolled" in self.settings.methods else self.lucy).problem
+        light = sum_pixels(subtract_offset(clean.astype(np.float32)), problem.binning)
+        volume = np.asarray(gs.rasterize(scene.emitters, problem.grid), np.float32)
+        image = np.asarray(gs.forward(volume, problem.imager, problem.grid, problem.optics))
+        gain = np.vdot(image, light) / np.vdot(image, image)
+        return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))
 
 
 def finer(grid: gs.Grid, width: float) -> gs.Grid:
@@ -257,11 +263,7 @@ def judged(
         rng = np.random.default_rng([seed, exposure])
         image = rng.poisson(clean * (exposure / brightest)) + rng.normal(0, READ_NOISE, clean.shape)
         image = image.astype(np.float32)
-        tried = {name: scores(v, truth, scene, grid) for name, v in methods.volumes(image).items()}
-        record: dict[str, Any] = {"unrolled": tried["unrolled"]} if "unrolled" in tried else {}
-        if steps := [name for name in tried if name.startswith("richardson-lucy")]:
-            best = max(steps, key=lambda name: tried[name]["psnr_db"])
-            record["richardson-lucy"] = tried[best] | {"steps": int(best.split()[-1])}
+        record: dict[str, Any] = {n: scores(v, truth, scene, grid) for n, v in methods.volumes(image).items()}
         if len(scene.points):
             record["f1"] = gs.localization(gs.find_points(image, imager, grid), scene.points).f1
         records[str(exposure)] = record
@@ -294,7 +296,7 @@ class Judge:
                     self.kept["scenes"].setdefault(key, float(clean.max()))
                 found = judged(small, scene, clean, self.brightest(key, scene), methods, draw)
                 if self.settings.images == "rays":
-                    found["model"] = model_error(small, scene, clean, self.settings)
+                    found["model"] = methods.model_error(scene, clean)
                 records[key] = found
                 write_json(self.file, self.kept)
         return records
@@ -345,14 +347,6 @@ def rows_of(by_design: dict[str, dict], settings: Settings) -> tuple[tuple[str, 
                 row.append(cell)
             rows.append(row)
     return ("scene", "electrons", *names), rows
-
-
-def model_error(imager: gs.Imager, scene: Scene, clean: np.ndarray, settings: Settings) -> float:
-    """Error of the full model's image of a scene on fine voxels, after the best gain, relative to a clean image."""
-    light = subtract_offset(clean.astype(np.float32))
-    image = image_by_model(scene.emitters, imager, finer(settings.grid, settings.width))
-    gain = np.vdot(image, light) / np.vdot(image, image)
-    return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))
 
 
 def report(

@@ -33,8 +33,8 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
     which emitters and the sensor are turned about the point of the vertices' plane above the sensor's centre.
 
     With a `tile`, mm, emitters within a square of that width and a twentieth of a millimetre in depth share the rays of
-    their mean place, displaced as chief rays are: many times the rays for the same time. Spots must hardly change
-    within a tile.
+    their mean place, displaced as chief rays are and to a quarter of a pixel: many times the rays for the same time.
+    Spots must hardly change within a tile.
     """
     images = np.zeros((PARTS, *imager.sensor.shape))
     emitters = _before(np.asarray(emitters, np.float64), imager)
@@ -189,7 +189,7 @@ def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
             if share > 0:
                 y, x = (y - origin[1]) / pixel + image.shape[0] / 2, (x - origin[0]) / pixel + image.shape[1] / 2
                 row, column = math.floor(y), math.floor(x)
-                pattern = patterns[int(FINE * (y - row)), int(FINE * (x - column))]
+                pattern = patterns[min(int(FINE * (y - row)), FINE - 1), min(int(FINE * (x - column)), FINE - 1)]
                 row, column = row + top, column + left
                 for i in range(max(-row, 0), min(tall, image.shape[0] - row)):
                     for j in range(max(-column, 0), min(wide, image.shape[1] - column)):

@@ -32,6 +32,8 @@ _SPARE = 16
 _BLUR, _NOISE = 0.7, 0.02
 # Coarse pixels around the sensor, for that filter and for the interpolation.
 _MARGIN = 12
+# Rows of pixels that are interpolated at once, and by how much pixels may be larger than those of the tables.
+_BLOCK, _STRETCH = 256, 1.1
 
 
 def stray_light_image(
@@ -80,11 +82,13 @@ def stray_light_image(
     image = jnp.zeros([n + 2 * outer + 2 + _SPARE for n in coarse], dtype)
     image = lax.scan(jax.checkpoint(add_lenses), image, _lens_groups(imager, optics, dtype))[0]
     image = lax.dynamic_slice(image, (outer + 1, outer + 1), coarse)
-    rows, columns = (
-        _upsampling_matrix(fine, rough, imager.sensor.pixel_pitch / pixel, dtype)
-        for fine, rough in zip(imager.sensor.shape, coarse, strict=True)
+    upsample = partial(
+        _upsample_rows, (imager.sensor.pixel_pitch / pixel, imager.sensor.pixel_pitch / polar_grid.pixel)
     )
-    return (rows @ image @ columns.T) * (imager.sensor.pixel_pitch / pixel) ** 2
+    rows, columns = (jnp.asarray(_wiener_matrix(count), dtype) for count in coarse)
+    # Columns first, where there are few rows.
+    across = upsample(imager.sensor.shape[1], (rows @ image @ columns).T)
+    return upsample(imager.sensor.shape[0], across.T) * (imager.sensor.pixel_pitch / pixel) ** 2
 
 
 def _lens_groups(imager, optics, dtype):
@@ -182,11 +186,21 @@ interpolate_windows = LinearMap(
 )
 
 
-def _upsampling_matrix(fine: int, coarse: int, ratio, dtype) -> Float[Array, "fine coarse"]:
-    """Along one axis, from the coarse pixels, sharpened, to the sensor's: Keys' cubic interpolation."""
-    place = (jnp.arange(fine, dtype=dtype) - (fine - 1) / 2) * ratio + (coarse - 1) / 2
-    x = jnp.abs(place[:, None] - jnp.arange(coarse, dtype=dtype)[None])
-    return cubic(x) @ jnp.asarray(_wiener_matrix(coarse), dtype)
+def _upsample_rows(ratio, fine: int, image: Float[Array, "coarse column"]) -> Float[Array, "fine column"]:
+    """Coarse rows to the sensor's by Keys' cubic interpolation, in blocks, each of which needs a few of them.
+
+    `ratio` is the sensor's pixel over the coarse one, and about the same as a Python number.
+    """
+    (ratio, about), coarse = ratio, len(image)
+    lines = min(_BLOCK, fine)
+    index = np.arange(-(-fine // lines) * lines).reshape(-1, lines) - (fine - 1) / 2
+    place = jnp.asarray(index, image.dtype) * ratio + (coarse - 1) / 2
+    size = min(math.ceil(_STRETCH * lines * about) + 6, coarse)
+    first = jnp.clip(jnp.floor(lax.stop_gradient(place[:, 0])).astype(jnp.int32) - 2, 0, coarse - size)
+    parts = jax.vmap(lambda start: lax.dynamic_slice_in_dim(image, start, size))(first)
+    row = (first[:, None] + jnp.arange(size, dtype=jnp.int32)[None]).astype(image.dtype)
+    weights = cubic(jnp.abs(place[:, :, None] - row[:, None, :]))
+    return (weights @ parts).reshape(-1, image.shape[1])[:fine]
 
 
 def cubic(distance):
