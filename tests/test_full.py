@@ -121,6 +121,9 @@ def test_windows_hold_the_image_of_the_whole_sensor(monkeypatch):
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
     np.testing.assert_allclose(jnp.vdot(found[2], x), jnp.vdot(found[0], found[0]), rtol=1e-12)
+    wider = dataclasses.replace(voxels, shape=tuple(n + 2 for n in voxels.shape))
+    with pytest.raises(InputError, match="optics must be of the grid's (width|extent)"):
+        forward(volume(wider.volume_shape), scope, wider, psf_model(scope, voxels, "full"))
     # Images that do not fit into their windows are no images.
     assert np.isnan(forward(x, scope, voxels, dataclasses.replace(table, windows=(16, 16)))).any()
 

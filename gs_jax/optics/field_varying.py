@@ -249,7 +249,8 @@ class FieldVaryingPsf(eqx.Module):
     large. `harmonics` and `wide_harmonics`: the kernels of `cos t`, `sin t`, `cos 2t` and `sin 2t` for those of the
     rings that have them, which are the last; `t` is the angle from the field's direction (`PsfCores`). `rings`: outer
     radii of the rings, in field radii. `windows`: sides of the squares of pixels, of inner and outer rings, in which
-    each lens shows all voxels of a small grid, or 0; set by `psf_model`.
+    each lens shows all voxels of a small grid, or 0, and `widest` the width of the grids that fit into them, mm; both
+    set by `psf_model`.
     """
 
     distortion: Float[Array, "depth ring"]
@@ -261,6 +262,7 @@ class FieldVaryingPsf(eqx.Module):
     stray_light: StrayLight
     rings: tuple[float, ...] = eqx.field(static=True)
     windows: tuple[int, int] = eqx.field(static=True, default=(0, 0))
+    widest: Float[Array, ""] | None = None
 
 
 def field_varying_psf(

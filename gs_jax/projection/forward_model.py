@@ -133,10 +133,7 @@ def psf_model(
         extent = max(2 * max(map(abs, imager.sensor.extent)), extent_of(grid))
         nodes = make_polar_grid(imager, depths, extent=extent, coarser=coarser)
         tables = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in imagers]
-        parts = [
-            dataclasses.replace(table, windows=window_sides(one, grid, table))
-            for one, table in zip(imagers, tables, strict=True)
-        ]
+        parts = [_windowed(table, one, grid) for one, table in zip(imagers, tables, strict=True)]
     else:
         areas = relative_areas(imagers).tolist() if len(imagers) > 1 else [1.0]
         parts = [area * field_constant_psf(one) for one, area in zip(imagers, areas, strict=True)]
@@ -148,6 +145,17 @@ def extent_of(grid: Grid) -> float:
     """Side of the square about the frame's origin that holds the centres of all voxels, mm."""
     beside, count = np.abs(np.asarray(grid.origin, float)), np.array(grid.shape[::-1])
     return float(np.max(2 * beside + (count - 1) * grid.pitch))
+
+
+def _windowed(table: FieldVaryingPsf, imager: Imager, grid: Grid) -> FieldVaryingPsf:
+    """Tables with windows for a grid that is small beside the sensor."""
+    windows = window_sides(imager, grid, table)
+    widest = jnp.asarray(_width(grid), table.distortion.dtype) if any(windows) else None
+    return dataclasses.replace(table, windows=windows, widest=widest)
+
+
+def _width(grid):
+    return max(grid.shape) * grid.pitch
 
 
 def check_optics(optics: Optics | str, imager: Imager, grid: Grid) -> None:
@@ -169,6 +177,9 @@ def check_optics(optics: Optics | str, imager: Imager, grid: Grid) -> None:
         raise InputError(f"optics must be of the sensor's pixels of {1000 * pixel:g} um, got {1000 * pitch:g} um.")
     if (extent := extent_of(grid)) > float(optics.extent) * (1 + _SAME):
         raise InputError(f"{allowed} extent, {extent:.6g} mm, got tables of {float(optics.extent):.6g} mm.")
+    widths = [float(widest) for part in optics.parts if (widest := getattr(part, "widest", None)) is not None]
+    if widths and (width := float(_width(grid))) > min(widths) * (1 + _SAME):
+        raise InputError(f"{allowed} width, {width:.6g} mm, got tables for {min(widths):.6g} mm.")
 
 
 def forward(
