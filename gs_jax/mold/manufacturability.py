@@ -207,8 +207,14 @@ def _check_layers(part: Part, wavelength: float, layer: float) -> CheckResult:
     return _warn_if(waves > MAX_WAVES, "layers", text, f": smooth them, or print layers of {finest:.2g} um.")
 
 
-def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUME_TOLERANCE) -> list[CheckResult]:
-    """Checks that a mesh, rounded as it will be written, is one solid without handles.
+def _holes(count: int) -> str:
+    return f" {count} hole{'s' * (count > 1)} through it" if count else "out handles"
+
+
+def check_solid(
+    mesh: Mesh, expected: float, name: str, tolerance: float = VOLUME_TOLERANCE, handles: int = 0
+) -> list[CheckResult]:
+    """Checks that a mesh, rounded as it will be written, is one solid with so many handles, as holes through it are.
 
     `expected` is its analytic volume, mm^3, and `tolerance` relative; `name` is that of the part.
     """
@@ -223,7 +229,7 @@ def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUM
     tests = {
         "watertight": (watertight, f"every edge of the {name} has one facet on either side"),
         "manifold": (manifold, f"the {name} is a manifold ({solid.status().name})"),
-        "genus": ((bodies, solid.genus()) == (1, 0), f"the {name} is one body without handles"),
+        "genus": ((bodies, solid.genus()) == (1, handles), f"the {name} is one body with{_holes(handles)}"),
         "volume": (error < tolerance, f"the {name} has {volume:.6g} mm3, {error:.1e} off the analytic volume"),
         "size": (True, f"the {name} is {size} mm (x, y, z), of {len(mesh.facets):,} facets"),
     }

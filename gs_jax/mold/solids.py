@@ -110,7 +110,7 @@ def array_solid(part: Part, chord: float = 5e-4, *, progress: Progress | None = 
     plate, column = (_box([-x / 2, -y / 2, bottom], [x / 2, y / 2, top]) for top in (0, part.height + _OVERCUT))
     lenses = m3.Manifold.batch_boolean(bodies, m3.OpType.Add) ^ column
     # Built with lenses up; mirroring also reverses the facets of a solid.
-    return _require_valid((lenses + plate).mirror([0, 0, 1]).translate([0, 0, bottom]))
+    return require_valid((lenses + plate).mirror([0, 0, 1]).translate([0, 0, bottom]))
 
 
 def preview_solid(part: Part, shape: MoldShape | None) -> m3.Manifold:
@@ -140,7 +140,7 @@ def _lenslet_body(lenslet: Lenslet, radius, chord, top, depth) -> m3.Manifold:
     wall = [np.stack([upper, lower, next_lower], axis=1), np.stack([upper, next_lower, next_upper], axis=1)]
     floor = np.stack([np.full(count - 2, lower[0]), lower[2:], lower[1:-1]], axis=1)
     mesh = m3.Mesh64(vertices, np.concatenate([facets, *wall, floor]).astype(np.uint64))
-    return _require_valid(m3.Manifold(mesh))
+    return require_valid(m3.Manifold(mesh))
 
 
 def check_part(part: Part) -> None:
@@ -170,7 +170,8 @@ def aperture_fault(part: Part) -> str:
     return ""
 
 
-def _require_valid(solid: m3.Manifold) -> m3.Manifold:
+def require_valid(solid: m3.Manifold) -> m3.Manifold:
+    """Return a solid; `RuntimeError` if it encloses nothing."""
     if solid.status() != m3.Error.NoError or solid.is_empty():
         raise RuntimeError(f"the surface encloses no solid: {solid.status().name}")
     return solid
@@ -202,7 +203,7 @@ def mold_solid(part: Part, solid: m3.Manifold, shape: MoldShape = MoldShape()) -
     """The negative mold: a block less the cavity of `solid`, which is `array_solid(part)`, marks and label."""
     opening = _opening(part, shape, shape.headroom + _OVERCUT)
     tools = [solid.scale([shape.scale] * 3), opening, *engraving_tools(part, shape)]
-    return _require_valid(m3.Manifold.batch_boolean([_box(*mold_bounds(part, shape)), *tools], m3.OpType.Subtract))
+    return require_valid(m3.Manifold.batch_boolean([_box(*mold_bounds(part, shape)), *tools], m3.OpType.Subtract))
 
 
 def engraving_tools(part: Part, shape: MoldShape) -> list[m3.Manifold]:
