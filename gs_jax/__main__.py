@@ -33,7 +33,7 @@ _MODULES = {
     "captures": ("calibrate", "simulate"),
     "designs": ("metrics", "layout", "optimize", "pareto", "info"),
     "new_design": ("new-design",),
-    "fabrication": ("tolerance", "mold", "mask", "heights"),
+    "fabrication": ("tolerance", "mold", "mask", "heights", "holder"),
     "presentation": ("report", "explore", "benchmark", "demo"),
     "train": ("train",),
 }

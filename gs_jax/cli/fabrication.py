@@ -1,4 +1,4 @@
-"""`gs-jax mold`, `mask`, `heights` and `tolerance`: fabrication of a design, and its errors."""
+"""`gs-jax mold`, `mask`, `heights`, `holder` and `tolerance`: fabrication of a design, and its errors."""
 
 import math
 from pathlib import Path
@@ -131,6 +131,55 @@ def heights_command(design: DesignPath, *, output: Path, step_um: SmallUm = 10.0
     count = f", {1e6 * scale:.4g} nm a count" if (scale := report.get("mm_per_count")) else ""
     click.echo(f"{output}: {what}{count}; read back, it is within {report['deviation_nm']:.2g} nm of the design")
     click.echo(f"{output}: {report['frame']}; (x, y) of the design is ({report['design_x_y']})")
+
+
+@command("holder", "Example: gs-jax holder my.toml --flange-mm 11.5 --bore-mm 42 --bolts-mm 56 -o rig.stl")
+def holder_command(
+    design: DesignPath,
+    *,
+    output: Path,
+    flange_mm: Annotated[float, Number(0.1, 200.0, "mm")] = 17.526,
+    bore_mm: Annotated[float, Number(1.0, 500.0, "mm")] | None = None,
+    bolts_mm: Annotated[float, Number(1.0, 500.0, "mm")] | None = None,
+    wall_mm: Annotated[float, Number(0.5, 20.0, "mm")] = 2.0,
+    clearance_mm: Annotated[float, Number(0.0, 2.0, "mm")] = 0.1,
+    pinhole_um: Annotated[float, Number(1.0, 1000.0, "um")] = 100.0,
+    target_mm: Annotated[float, Number(0.1, 1e4, "mm")] | None = None,
+    force: bool = False,
+):
+    """Make a holder that keeps the array of DESIGN before a camera, and a target of pinholes to calibrate by.
+
+    The array's plano face lies on the holder's ledge, which is printed so that the named shims, under its shoulder,
+    make up the sensor distance. The camera has a C-mount thread, or with --bore-mm any round opening. The target, a cap
+    for the holder, is RIG-target.stl, the places of its pinholes RIG-target.csv, for `calibrate --positions`.
+    RIG.stl.png shows all in section; RIG.stl.json has the numbers.
+
+    Options:
+        output: RIG.stl or RIG.3mf.
+        flange_mm: Distance from the sensor to the camera's face on which the holder stands.
+        bore_mm: Diameter of the opening in that face. [default: a C-mount thread]
+        bolts_mm: Diameter of the circle of four M3 screws about the opening; needs --bore-mm.
+        wall_mm: Thickness of walls.
+        clearance_mm: Gap between parts that fit into each other.
+        pinhole_um: Diameter of the pinholes.
+        target_mm: Depth of the pinholes from the array's front. [default: the middle of the working distance]
+    """
+    from ..design.design import read_design
+    from ..mold.export import MESH_SUFFIXES
+    from ..mold.holder import HolderShape
+    from ..mold.rig import rig_files, write_rig
+
+    if bolts_mm and not bore_mm:
+        raise InputError("--bolts-mm must be used with --bore-mm: a C-mount thread needs no screws.")
+    check_outputs(output, MESH_SUFFIXES, *rig_files(output), inputs=(design,), force=force)
+    microscope = read_design(design)
+    shape = HolderShape(flange_mm, bore_mm, bolts_mm, wall_mm, clearance_mm, pinhole_um / 1000, target_mm)
+    with Progress() as progress, errors_name_file(design):
+        provenance = provenance_of(design, design=microscope)
+        report = write_rig(microscope, output, shape, provenance=provenance, progress=progress)
+    for check in report["checks"]:
+        click.echo(f"[{check['level']}] {check['check']}: {check['text']}")
+    click.echo(f"{', '.join(report['files'])}: in mm, {report['frame']}")
 
 
 def _tolerance_options() -> list[click.Option]:

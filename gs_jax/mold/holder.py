@@ -35,22 +35,26 @@ SHIMS, LEAST_SHIMS = (0.5, 0.2, 0.1, 0.05, 0.025), 0.1
 # Thickness of ledge and flange, height of the collar, and of the edge that guards the lenses.
 LEDGE, _FLANGE, _COLLAR, _GUARD = 1.0, 2.0, 2.0, 0.5
 # Width of the ledge, at most this part of the plate.
-_LEDGE_WIDTH, _LEDGE_PART = 0.8, 0.05
+_LEDGE_WIDTH, _LEDGE_PART = 0.5, 0.05
 # Least distance of the holder from the window, or from the sensor without one.
 _FROM_WINDOW = 0.2
+# Heights are multiples of this, which usual layers of printers divide.
+_LAYER = 0.05
 # Holes and heads of M3 screws; depth of the collar's flat, in walls.
 _HOLE, _HEAD, _FLAT = 3.4, 5.5, 0.4
-# The target's end, the wall about a pinhole, both at least, and the slope of the cone behind it: half of 60 degrees.
+# The target's end, the wall about a pinhole, both at least, and the slope of the cone behind it, 30 degrees.
 _END, _MEMBRANE, _CONE = 1.5, 0.1, math.tan(math.radians(30))
 # Widest image of a pinhole whose middle `calibrate` finds as that of a sharp spot, pixels.
-_WIDEST = 5
+_WIDEST = 6
+# Indices of layers that are gaps.
+AIR_NAMES = (1, "air")
 # Segments of circles and of pinholes.
 _SEGMENTS, _PINHOLE_SEGMENTS = 128, 32
 
 
 @dataclass(frozen=True)
 class HolderShape:
-    """The camera that a holder is for, and how it is printed, mm.
+    """The camera that a holder is for, and what is printed, mm.
 
     Parameters
     ----------
@@ -62,8 +66,6 @@ class HolderShape:
         Diameter of the circle of four M3 screws at 45 degrees about the opening; None without any.
     wall, clearance
         Thickness of walls, and gap between parts that fit into each other.
-    layer
-        Thickness of the printer's layers, of which heights are multiples.
     pinhole
         Diameter of the target's pinholes.
     target
@@ -75,7 +77,6 @@ class HolderShape:
     bolts: float | None = None
     wall: float = 2.0
     clearance: float = 0.1
-    layer: float = 0.05
     pinhole: float = 0.1
     target: float | None = None
 
@@ -139,7 +140,7 @@ class Holder:
     @cached_property
     def seat(self) -> float:
         """Height of the ledge, a whole number of layers below `step`."""
-        return math.floor((self.step - LEAST_SHIMS) / self.shape.layer + 1e-6) * self.shape.layer
+        return math.floor((self.step - LEAST_SHIMS) / _LAYER + 1e-6) * _LAYER
 
     @property
     def shims(self) -> float:
@@ -220,11 +221,11 @@ class Holder:
         edge = sum(layer.thickness_mm for layer in design.layers.sensor)
         if (left := self.bottom - self.sensor - edge) < _FROM_WINDOW:
             what = "the camera's window" if design.layers.sensor else "the sensor"
-            short = f"`imaging.sensor_distance_mm` must leave {_FROM_WINDOW - left:.3g} mm more"
-            yield f"{short} for the holder, which ends {left:.3g} mm from {what}, got {design.imaging.sensor_distance_mm:g}."
+            short, v = f"{_FROM_WINDOW - left:.3g} mm more for the holder", design.imaging.sensor_distance_mm
+            yield f"`imaging.sensor_distance_mm` must leave {short}, which ends {left:.3g} mm from {what}, got {v:g}."
         air = 0.0
         for layer in design.layers.object if self.side > 0 else ():
-            if air < LEDGE and layer.refractive_index != 1:
+            if air < LEDGE and layer.refractive_index not in AIR_NAMES:
                 text = f"`layers.object` must begin with {LEDGE:g} mm of air or more, for the holder's ledge"
                 yield f"{text}, got {layer.name or 'a layer'} at {air:g} mm."
             air += layer.thickness_mm
@@ -234,8 +235,8 @@ class Holder:
         if self.depth - (begin := float(self.imager.sample_surface)) < MIN_THICKNESS_MM or self.reach < _COLLAR:
             least = max(begin + MIN_THICKNESS_MM, self.depth - self.reach + _COLLAR)
             yield f"--target-mm must be {least:.4g} or more, beyond the collar and the filters, got {self.depth:g}."
-        if self.spread < (least := shape.pinhole + 2 * self.cone):
-            yield f"--pinhole-um must leave {1000 * least:.4g} um between pinholes, got {1000 * self.spread:.4g} um."
+        if shape.pinhole > (most := self.spread / 2):
+            yield f"--pinhole-um must be at most {1000 * most:.4g}, half of their distance, got {1000 * shape.pinhole:g}."
 
     @property
     def _mouth(self) -> float:
@@ -248,7 +249,7 @@ class Holder:
         """Depth of the pinholes from the array's front, at whole layers from the flange."""
         near, far = self.design.imaging.working_distance_mm
         wanted = (near + far) / 2 if self.shape.target is None else self.shape.target
-        height = round((self.front + wanted - _FLANGE) / self.shape.layer) * self.shape.layer
+        height = round((self.front + wanted - _FLANGE) / _LAYER) * _LAYER
         return round(height + _FLANGE - self.front, 6)
 
     @property
@@ -267,8 +268,8 @@ class Holder:
 
     @property
     def cone(self) -> float:
-        """By how much the radius of the cone behind a pinhole grows."""
-        return (_END - self.membrane) * _CONE
+        """By how much the radius of the cone behind a pinhole grows; cones do not touch."""
+        return min((_END - self.membrane) * _CONE, 0.45 * (self.spread - self.shape.pinhole))
 
     @property
     def spread(self) -> float:
@@ -276,8 +277,7 @@ class Holder:
         design = self.design
         rows, columns = design.sensor.shape
         sensor = min(rows, columns) * design.sensor.pixel_pitch_um / 2000
-        widest = self.collar + self.shape.clearance - self.cone - self.membrane
-        return round(min(float(self.plate.min()) / 2, sensor / 2, design.imaging.field_radius_mm, widest), 1)
+        return round(min(float(self.plate.min()) / 2, sensor / 2, design.imaging.field_radius_mm, self.collar / 2), 1)
 
 
 def make_rig(design: Design, shape: HolderShape = HolderShape()) -> Rig:
@@ -413,19 +413,23 @@ def _checks(rig: Holder) -> list[CheckResult]:
     # Longitudinal magnification: what a change of the sensor distance moves in the object.
     magnification = float(rig.imager.magnification(rig.depth))
     stack, rest = " + ".join(f"{1000 * shim:g}" for shim in shims), 1000 * (rig.shims - sum(shims))
-    where = "above" if rig.seat > 0 else "below"
-    sign = (
-        f"{rig.step:.4g} mm less the measured height" if rig.seat > 0 else f"the measured depth less {-rig.step:.4g} mm"
+    if rig.seat > 0:
+        where, needed = "above", f"{rig.step:.3f} mm less the measured height"
+    else:
+        where, needed = "below", f"the measured depth less {-rig.step:.3f} mm"
+    text = (
+        f"{stack} um (rest {rest:+.1f} um) under the shoulder; its ledge is printed {abs(rig.seat):.4g} mm {where} that"
     )
-    text = f"{stack} um (rest {rest:+.1f} um) under the shoulder of a holder whose ledge is {abs(rig.seat):.4g} mm {where} it"
     moved = f"25 um move the depth in focus by {0.025 / magnification**2:.2g} mm"
-    checks = [CheckResult("shims", "ok", f"{text}. Measure the print: shims are {sign}; {moved}.")]
+    checks = [CheckResult("shims", "ok", f"{text}. Measure it: shims are {needed}; {moved}.")]
     seen, lenses = int(_whole_views(rig).sum()), len(rig.design.array.centers_mm)
     text = f"{seen} of {lenses} lenses see all of their field through the holder"
     checks.append(CheckResult("view", "ok" if seen == lenses else "warning", f"{text}."))
     width = magnification * rig.shape.pinhole / pixel
     text = f"{1000 * rig.shape.pinhole:g} um at {rig.depth:g} mm are {width:.2g} pixels on the sensor"
-    advice = f"calibrate finds spots up to {_WIDEST}: give it --binning {math.ceil(width / _WIDEST)}, or a smaller --pinhole-um"
+    advice = (
+        f"calibrate finds spots up to {_WIDEST}: give it --binning {math.ceil(width / _WIDEST)}, or drill finer ones"
+    )
     wide = width > _WIDEST
     checks.append(CheckResult("pinholes", "warning" if wide else "ok", f"{text}{f'; {advice}' if wide else ''}."))
     return checks

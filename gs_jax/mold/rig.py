@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
-from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.typing import PathLike
 from ..design.design import Design
@@ -18,7 +17,7 @@ from ..io.files import check_output, side_file, write_figure, write_json
 from ..io.point_tables import write_rows
 from ..io.provenance import KEY, Provenance, sidecar
 from .export import MESH_SUFFIXES, float32_mesh, write_mesh
-from .holder import Holder, HolderShape, Rig, make_rig
+from .holder import AIR_NAMES, Holder, HolderShape, Rig, make_rig
 from .lenslets import Part
 from .make import draw_solid
 from .manufacturability import check_solid, open_design, raise_first_error
@@ -53,12 +52,9 @@ def write_rig(
     progress = progress or Progress()
     path = check_output(path, MESH_SUFFIXES)
     target, places, _, picture, record = (check_output(beside, [beside.suffix]) for beside in rig_files(path))
-    design, source = open_design(design)
+    design, _ = open_design(design)
     with progress.step("Building and checking the solids"):
-        try:
-            rig = make_rig(design, shape)
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from error
+        rig = make_rig(design, shape)
         pinholes = len(rig.places)
         solids = {
             "holder": (path, rig.holder, rig.holder_volume, 5 if shape.bolts else 1),
@@ -102,7 +98,8 @@ def draw_rig(design: Design, shape: HolderShape, rig: Rig) -> Figure:
 
 def _draw_section(axes, design: Design, holder: Holder, rig: Rig) -> None:
     def fill(corners, name, label):
-        patch = PathPatch(Outline.make_compound_path(*(Outline(c, closed=False) for c in corners)))
+        rings = (Outline(np.concatenate([ring, ring[:1]]), closed=True) for ring in corners)
+        patch = PathPatch(Outline.make_compound_path(*rings))
         patch.set(facecolor=_COLORS[name], edgecolor="black", linewidth=0.6, label=label)
         axes.add_patch(patch)
 
@@ -116,35 +113,32 @@ def _draw_section(axes, design: Design, holder: Holder, rig: Rig) -> None:
     fill(box(half, holder.sensor - 0.3, holder.sensor), "sensor", "sensor")
     height = holder.sensor
     for layer in design.layers.sensor:
-        if layer.refractive_index != 1:
+        if layer.refractive_index not in AIR_NAMES:
             fill(box(1.1 * half, height, height + layer.thickness_mm), "window", layer.name or "window")
         height += layer.thickness_mm
     face, mouth = -holder.shims, (holder.shape.bore or 25.4) / 2
     for sign in (-1, 1):
-        axes.plot([sign * mouth, sign * (holder.rim + 2)], [face, face], color="black", linewidth=1.5)
+        axes.plot([sign * mouth, sign * 1.15 * holder.rim], [face, face], color="black", linewidth=1.5)
         axes.plot([sign * mouth] * 2, [face, holder.sensor], color="black", linewidth=1.5, linestyle=":")
-    numbers = rig.numbers
+    numbers, end = rig.numbers, holder.front + holder.depth
     shims = " + ".join(f"{1000 * shim:g}" for shim in numbers["shims_mm"])
-    end = holder.front + holder.depth
-    seat = f"ledge at {holder.seat:+.2f}, {numbers['step_mm']:.3f} above the camera's face"
-    for level, text in (
-        (end, f"pinholes of {numbers['pinhole_um']:g} um, {holder.depth:g} from the array's front"),
-        (holder.seat, seat),
-        (face, f"camera's face, {holder.shape.flange:g} from the sensor; shims {shims} um"),
-        (holder.sensor, f"sensor, {numbers['sensor_distance_mm']:g} from the array"),
-    ):
+    labels = {
+        end: f"pinholes of {numbers['pinhole_um']:g} um, {holder.depth:g} from the array's front",
+        holder.seat: f"ledge, printed at {holder.seat:+.2f}; {holder.step:+.3f} from the camera's face",
+        face: f"camera's face, {holder.shape.flange:g} from the sensor; shims of {shims} um",
+        holder.sensor: f"sensor, {numbers['sensor_distance_mm']:g} from the array",
+    }
+    apart, below = (end - holder.sensor) / 16, -np.inf
+    for level in sorted(labels):
+        below = max(level, below + apart)
+        style = {"arrowstyle": "-", "linewidth": 0.5, "shrinkB": 0}
+        begin = (1.3 * holder.rim, below)
         axes.annotate(
-            text,
-            (holder.rim, level),
-            (holder.rim + 3, level),
-            va="center",
-            fontsize=8,
-            annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "linewidth": 0.5, "shrinkB": 0},
+            labels[level], (holder.rim, level), begin, va="center", fontsize=8, annotation_clip=False, arrowprops=style
         )
     axes.set(xlabel="x, mm", ylabel="z, mm", title="section at y = 0, lengths in mm", aspect="equal")
-    axes.set(xlim=(-holder.rim - 3, holder.rim + 3), ylim=(holder.sensor - 2, end + 4))
-    axes.legend(loc="lower center", ncol=5, fontsize=8, bbox_to_anchor=(0.5, -0.2), frameon=False)
+    axes.set(xlim=(-1.2 * holder.rim, 1.2 * holder.rim), ylim=(holder.sensor - 2, end + 6))
+    axes.legend(loc="upper center", ncol=5, fontsize=8, frameon=False)
 
 
 def _cut(solid: m3.Manifold) -> list[np.ndarray]:
