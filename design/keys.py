@@ -80,6 +80,7 @@ def page() -> str:
         lines += [_row(key) for key in shown]
         lines.append("")
     lines.append(f"`[samples.NAME]`: {design_keys()['samples'].meaning}.\n")
+    lines.append(f"`[channels.NAME]`: {design_keys()['channels'].meaning}.\n")
     lines.append(f"`[provenance]`: {design_keys()['provenance'].meaning}.")
     return "\n".join(lines) + "\n" + TAIL
 

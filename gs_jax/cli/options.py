@@ -8,7 +8,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -179,7 +179,9 @@ class PictureOptions(OptionGroup):
 
     Options:
         page: Page of a capture of several, from 1; or mean, to average repeated frames.
-        channel: Channel of a colour capture or of a --bayer mosaic.
+        channel: red, green or blue of a colour capture or a --bayer mosaic; or a channel of CAPTURE, by its name or its
+            number from 1. Of several, separated by commas, `reconstruct` makes one volume, each at the wavelength of
+            [channels.NAME] in DESIGN.
         bayer: The capture is a raw mosaic whose first pixels are these. Nothing is interpolated.
         dark: DARK.tif: dark frame of the capture's exposure; several pages are averaged.
         flat: FLAT.tif: even light on the sensor without the array; several pages are averaged.
@@ -188,7 +190,7 @@ class PictureOptions(OptionGroup):
     """
 
     page: Page | None = None
-    channel: Annotated[str, click.Choice(["red", "green", "blue"])] | None = None
+    channel: str | None = None
     bayer: Annotated[str, click.Choice(["RGGB", "BGGR", "GRBG", "GBRG"])] | None = None
     dark: Path | None = None
     flat: Path | None = None
@@ -342,6 +344,11 @@ class Light(OptionGroup):
 
         sample = self.sample if self.sample_index is None else Sample(self.sample_index, self.sample_at)
         return design.imager(sample, self.wavelength_nm)
+
+    def of_channel(self, design, name: str | None) -> Any:
+        """These, with the wavelength that a design lists for a channel, unless another was given."""
+        listed = design.channels.get(name)
+        return self if listed is None or self.wavelength_nm else replace(self, wavelength_nm=listed.wavelength_nm)
 
     def read_design(self, path: Path) -> Any:
         """Read a design, with these in place of its own; its working distance begins in the object's medium."""

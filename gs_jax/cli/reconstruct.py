@@ -12,6 +12,7 @@ import numpy as np
 from ..base.errors import InputError, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output
+from .channels import reconstruct_channels
 from .commands import (
     RESUMABLE,
     OptionGroup,
@@ -165,6 +166,10 @@ def reconstruct_command(
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)
+    names = [name.strip() for name in (camera.channel or "").split(",")]
+    if len(names) > 1:
+        return reconstruct_channels(capture, microscope, names, depths, voxel_um, options, output, light, camera)
+    light = light.of_channel(microscope, camera.channel)
     imager = camera.imager(light.imager(microscope))
     frame, from_array = DepthFrame(light.origin(imager)), light.from_array(depths, imager)
     if recording.warm_start and workers.remote:
@@ -177,7 +182,7 @@ def reconstruct_command(
         series.check(None)
         with Progress() as progress:
             return series.watch(progress)
-    with open_recording(capture, page=camera.page) as frames, Progress() as progress:
+    with open_recording(capture, page=camera.page, channel=camera.channel) as frames, Progress() as progress:
         if tiles is not None:
             return series.reconstruct_in_tiles(None if tiles == "auto" else int(tiles), frames, progress)
         if series.check(frames):

@@ -304,7 +304,9 @@ def _open_frames(capture: Path, camera: CaptureOptions, plan):
 
     stack = ExitStack()
     atexit.register(stack.close)
-    return _frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
+    return _frames_of(
+        stack.enter_context(open_recording(capture, page=camera.page, channel=camera.channel)), camera, plan
+    )
 
 
 def _frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False):

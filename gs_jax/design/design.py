@@ -33,6 +33,7 @@ from .tables import (
     ArrayTable,
     CalibrationTable,
     CentersTable,
+    ChannelTable,
     ImagingTable,
     LayersTable,
     LensTable,
@@ -71,6 +72,11 @@ class Design(Table):
     samples: dict[str, SampleTable] = Field(
         default={},
         title="samples by name, each a table like `[sample]`, for `--sample NAME`; one is needed without `[sample]`",
+        description="a table of tables",
+    )
+    channels: dict[str, ChannelTable] = Field(
+        default={},
+        title="channels of captures by name, each with its `wavelength_nm`, for `--channel NAME` or several such names",
         description="a table of tables",
     )
     calibration: CalibrationTable = _table(
@@ -214,7 +220,7 @@ class Design(Table):
         ----------
         **values
             By key, without the name of its table: `centers_mm`, `sensor_distance_mm`, `shape`, ... Lists may be arrays.
-            `layers`, `sample`, `samples` and `provenance` are replaced as a whole.
+            `layers`, `sample`, `samples`, `channels` and `provenance` are replaced as a whole.
 
         Raises
         ------
@@ -242,7 +248,7 @@ class Design(Table):
 
 # Whose keys all differ, and what is replaced as a whole.
 _TABLES = ("sensor", "lens", "array", "imaging", "calibration")
-_WHOLE = ("name", "layers", "sample", "samples", "provenance")
+_WHOLE = ("name", "layers", "sample", "samples", "channels", "provenance")
 
 
 def _fields(table: str):

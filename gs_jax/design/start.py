@@ -249,7 +249,7 @@ def commented(design: Design) -> str:
     for table in sorted(data, key=lambda table: (table in ("array", "provenance"), table == "provenance")):
         title = known[table].meaning
         lines += ["", *_comment(f"{title[:1].upper()}{title[1:]}.")]
-        if table in ("provenance", "samples"):
+        if table in ("provenance", "samples", "channels"):
             lines.append(as_toml({table: data[table]}).rstrip())
             continue
         lines.append(f"[{table}]")

@@ -206,6 +206,12 @@ class SampleTable(Table):
     )
 
 
+class ChannelTable(Table):
+    """`[channels.NAME]`: a channel of captures."""
+
+    wavelength_nm: Wavelength = Field(title="wavelength of the light in the channel, in air")
+
+
 class CalibrationTable(Table):
     """`[calibration]`: the array as found on the sensor, rotated about its centre (+x toward +y), shifted, then tilted.
 

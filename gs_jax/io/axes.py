@@ -3,6 +3,7 @@
 The pages are declared by the OME-XML of an OME-TIFF, or by the index of an NDTiff data set of Micro-Manager.
 """
 
+import contextlib
 import math
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -87,6 +88,17 @@ class OmePlanes(NamedTuple):
 def is_ome(description: str) -> bool:
     """Whether a description of a TIFF is OME-XML."""
     return description.lstrip().startswith(("<?xml", "<OME")) and "OME" in description[:1000]
+
+
+def channel_names(description: str) -> list[str]:
+    """Names of the channels of the first image that OME-XML describes; empty without all of them."""
+    if not is_ome(description):
+        return []
+    with contextlib.suppress(ElementTree.ParseError):
+        pixels = ElementTree.fromstring(description).find("{*}Image/{*}Pixels")
+        names = [] if pixels is None else [each.get("Name", "") for each in pixels.iterfind("{*}Channel")]
+        return names if all(names) else []
+    return []
 
 
 def read_ome(path: Path, description: str, pages: int) -> list[OmePlanes]:

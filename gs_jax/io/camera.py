@@ -11,7 +11,18 @@ from jaxtyping import Bool, Float, Float32, Num, Shaped
 from ..base.errors import InputError, errors_name_file, input_error
 from ..base.typing import PathLike
 from ..microscope.grid import Sensor
-from .captures import DTYPES, REPEATS, Selection, average, mosaic_channel, mosaic_sites, read_images, size_text
+from .captures import (
+    CHANNELS,
+    DTYPES,
+    REPEATS,
+    GreyError,
+    Selection,
+    average,
+    mosaic_channel,
+    mosaic_sites,
+    read_images,
+    size_text,
+)
 
 # Pixels of the flat field below this share of its median are bad.
 _MIN_GAIN = 0.05
@@ -88,7 +99,9 @@ class Readout(NamedTuple):
         lines = []
         if self.channel:
             mosaic = f"the mosaic {self.bayer}, an image of its cells of 2 x 2 pixels"
-            lines.append(f"{self.channel} of {mosaic if self.bayer else 'a colour image'}")
+            is_colour = self.bayer or self.channel in CHANNELS
+            of = f" of {mosaic if self.bayer else 'a colour image'}"
+            lines.append(f"{self.channel}{of}" if is_colour else f"channel {self.channel}")
         if self.roi:
             row, column, rows, columns = self.roi
             lines.append(f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1} of the sensor")
@@ -223,8 +236,14 @@ def prepare(
     dark, gain = correction.offset or None, None
 
     def read_like_capture(path: Path) -> np.ndarray:
-        images = read_images(path, Selection(shape, REPEATS, readout.channel, readout.bayer))
-        image, _, more = _average(path, images, readout)
+        selection = Selection(shape, REPEATS, readout.channel, readout.bayer)
+        try:
+            image, _, more = _average(path, read_images(path, selection), readout)
+        except GreyError:
+            # A file of one channel corrects all.
+            if readout.channel in CHANNELS:
+                raise
+            image, _, more = _average(path, read_images(path, selection._replace(channel=None)), readout)
         warnings.extend(more)
         return _checked_size(path, image, size)
 

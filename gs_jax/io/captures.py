@@ -7,7 +7,7 @@ Size and type are checked as the file declares them, before pixels are decoded. 
 import contextlib
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..base.typing import PathLike
-from .axes import UNNAMED, stack_axis, stack_error
+from .axes import UNNAMED, channel_names, stack_axis, stack_error
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .provenance import KEY, Provenance, write_sidecar
 from .tiff import Tiff, decode_plane, mosaic_pattern, open_tiff
@@ -33,6 +33,9 @@ PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_PIXELS = 10**9
 DTYPES = ("uint8", "uint16", "float32")
 CAPTURE_SUFFIXES = (*TIFF_SUFFIXES, ".png", ".npy")
+# Files of other programs, which are read alone, by `open_vendor`.
+VENDOR_SUFFIXES = (".nd2", ".czi", ".lif", ".h5", ".hdf5")
+READ_SUFFIXES = (*CAPTURE_SUFFIXES, *VENDOR_SUFFIXES)
 # Pages that are chosen for files that go together: the one that a file has for itself, though it may be one of a set;
 # and all, if they are repeats of one image.
 OWN, REPEATS = "own", "repeats"
@@ -51,7 +54,7 @@ class Source(NamedTuple):
 
     `axes` are names and lengths of its axes before y and x, and `size` its rows and columns, as it declares them;
     `names` are those of the images, for messages; `read` reads the selected part of an image, counted from 0; `files`
-    are those that are read, except the many of a Zarr store.
+    are those that are read, except the many of a Zarr store; `channels` are names along the axis c, if it declares any.
     """
 
     axes: list[tuple[str, int]]
@@ -59,6 +62,7 @@ class Source(NamedTuple):
     names: list[str]
     read: Callable[[int, "Selection"], np.ndarray]
     files: list[Path]
+    channels: Sequence[str] = ()
 
 
 class Selection(NamedTuple):
@@ -92,7 +96,8 @@ def read_capture(
     page
         Page of a file of several, counted from 1; or "mean", the float32 mean of all.
     channel
-        "red", "green" or "blue" of a colour image or a mosaic.
+        "red", "green" or "blue" of a colour image or a mosaic; of a file with an axis of channels the name of one, or
+        its number from 1.
     bayer
         Colours of the first 2 x 2 pixels of a mosaic, row by row, such as "RGGB". The capture then has one pixel per
         2 x 2 cell; see `gs_jax.io.camera.Readout`.
@@ -125,11 +130,11 @@ def average(images: Iterable[Shaped[np.ndarray, "row column"]]) -> Shaped[np.nda
 def read_images(path: PathLike, selection: Selection = Selection()) -> Images:
     """Yield the selected pages of a capture, of a mosaic with all of its pixels; errors as `read_capture`."""
     path, page = check_input(path), selection.page
-    check_suffix(path, CAPTURE_SUFFIXES)
+    check_suffix(path, READ_SUFFIXES)
     if selection.bayer:
         mosaic_sites(selection.bayer, selection.channel)
     shape = selection.shape and tuple(selection.shape)
-    with open_source(path, page) as source:
+    with open_source(path, page, selection.channel) as source:
         if page == REPEATS:
             check_stack(path, source, "tz", "; its images are not repeats of one")
         indices = _pages(path, len(source.names), page)
@@ -137,12 +142,21 @@ def read_images(path: PathLike, selection: Selection = Selection()) -> Images:
 
 
 @contextlib.contextmanager
-def open_source(path: Path, page: int | str | None = None) -> Iterator[Source]:
-    """Open the images of a file; those of a TIFF are its pages if one is chosen by its number."""
+def open_source(path: Path, page: int | str | None = None, channel: str | None = None) -> Iterator[Source]:
+    """Open the images of a file, of one channel if it is given or the file is of another program.
+
+    Those of a TIFF are its pages if one is chosen by its number.
+    """
     suffix = path.suffix.lower()
-    if suffix in TIFF_SUFFIXES:
+    if suffix in VENDOR_SUFFIXES:
+        from .vendors import open_vendor
+
+        with open_vendor(path) as source:
+            yield of_channel(path, source, channel)
+    elif suffix in TIFF_SUFFIXES:
         with open_tiff(path) as tiff:
-            yield _tiff_source(tiff, page)
+            source = _tiff_source(tiff, page)
+            yield of_channel(path, source, channel) if channel else source
     elif suffix == ".npy":
         pixels = open_npy(path)
         pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
@@ -151,6 +165,42 @@ def open_source(path: Path, page: int | str | None = None) -> Iterator[Source]:
         yield Source([(UNNAMED, len(pages))], pages.shape[1:], names, read, [path])
     else:
         yield Source([(UNNAMED, 1)], (), [path.name], lambda _, selection: _read_png(path, selection), [path])
+
+
+def of_channel(path: Path, source: Source, channel: str | None) -> Source:
+    """Take one channel of a source with an axis of channels, by its name or its number from 1; others are unchanged.
+
+    Raises `InputError` unless one is chosen of several.
+    """
+    at = next((number for number, (name, _) in enumerate(source.axes) if name == "c"), None)
+    if at is None:
+        return source
+    lengths = [length for _, length in source.axes]
+    names = list(source.channels)
+    names = names if len(names) == lengths[at] else [str(number) for number in range(1, lengths[at] + 1)]
+    lower, wanted = [name.lower() for name in names], (channel or "").lower()
+    if wanted in lower:
+        chosen = lower.index(wanted)
+    elif wanted.isdecimal() and 1 <= int(wanted) <= len(names):
+        chosen = int(wanted) - 1
+    elif len(names) == 1:
+        return source
+    else:
+        raise input_error("--channel", f"{listed(names)}, or a number from 1", short_repr(channel or "none"), path)
+    axes = [axis for number, axis in enumerate(source.axes) if number != at]
+    indices = np.take(np.arange(len(source.names)).reshape(lengths), chosen, at).ravel().tolist()
+
+    def read(index: int, selection: Selection) -> np.ndarray:
+        return source.read(indices[index], selection._replace(channel=None))
+
+    return source._replace(
+        axes=axes or [(UNNAMED, 1)], names=[source.names[k] for k in indices], read=read, channels=()
+    )
+
+
+def listed(names: Sequence[str], most: int = 5) -> str:
+    """The first few names as text."""
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
 def check_images(path: PathLike, images: Images) -> Images:
@@ -342,7 +392,8 @@ def _tiff_source(tiff: Tiff, page: int | str | None) -> Source:
 
     names = [f"{image[0].name}, page {image[1] + 1}" if image else f"{tiff.path.name}, no page" for image in images]
     files = list(dict.fromkeys([tiff.path, *(image[0] for image in images if image)]))
-    return Source(axes, (tiff.first.imagelength, tiff.first.imagewidth), names, read, files)
+    size = (tiff.first.imagelength, tiff.first.imagewidth)
+    return Source(axes, size, names, read, files, channel_names(tiff.first.description))
 
 
 def check_stack(path: Path, source: Source, axes: str, advice: str = "") -> None:

@@ -24,23 +24,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from ..base.errors import InputError, input_error, needs_extra, short_repr
+from ..base.errors import InputError, input_error, short_repr
 from ..base.typing import PathLike, Volume
 from ..microscope.grid import Grid
 from .files import JOURNAL, atomic_write, decoding, disk_errors_name
 from .names import plain_text
 from .provenance import KEY, Provenance, surface_of
+from .remote import has_key, import_zarr
 
 CHUNK = 1024
+# Colours of channels, in turns.
+_COLORS = ["00FF00", "FF00FF", "00FFFF", "FFFF00", "FF0000", "0000FF"]
 # Percentiles of the displayed values, of up to so many rows and columns.
 _DISPLAYED, _SAMPLES = (1, 99.9), 512
-
-
-def import_zarr() -> Any:
-    """The package zarr, which TIFF does not need; `InputError` if it is not installed."""
-    with needs_extra("zarr"):
-        import zarr  # 0.15 s
-    return zarr
 
 
 def ngff_attributes(group: Any) -> dict[str, Any]:
@@ -100,11 +96,13 @@ def image_attributes(
     version: str = "0.4",
     in_time: bool = False,
     interval: float | None = None,
+    channels: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Attributes of the Zarr group of an image; `InputError` if the depths are not in even, ascending steps.
 
     `levels` of a pyramid, each of half the rows and columns; `voxels` set the display range; `version` of OME-Zarr, 0.4
-    or 0.5; `in_time`: the first axis is time, with `interval` seconds between frames, if they are known.
+    or 0.5; `in_time`: the first axis is time, with `interval` seconds between frames, if they are known. `channels` are
+    names along a first axis of `voxels`, in place of time.
     """
     pitch = grid.pitch
     scale, first = [um(_step(path, depths, pitch)), um(pitch), um(pitch)], [um(depths[0]), *first_um(grid)]
@@ -112,9 +110,13 @@ def image_attributes(
     if in_time:
         axes.insert(0, {"name": "t", "type": "time"} | ({"unit": "second"} if interval else {}))
         scale, first = [interval or 1.0, *scale], [0.0, *first]
-    low, high = display_range(voxels)
-    window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
-    channel = {"active": True, "color": "FFFFFF", "label": title(path), "window": window}
+    if channels:
+        axes.insert(0, {"name": "c", "type": "channel"})
+        scale, first = [1.0, *scale], [0.0, *first]
+    shown = (
+        zip(channels, voxels, itertools.cycle(_COLORS), strict=False) if channels else [(title(path), voxels, "FFFFFF")]
+    )
+    entries = [_shown(*each) for each in shown]
     multiscale = {
         **({"version": version} if version == "0.4" else {}),
         "name": title(path),
@@ -124,9 +126,15 @@ def image_attributes(
             for level in range(levels)
         ],
     }
-    attributes = {"multiscales": [multiscale], "omero": {"channels": [channel], "rdefs": {"model": "greyscale"}}}
+    attributes = {"multiscales": [multiscale], "omero": {"channels": entries, "rdefs": {"model": "greyscale"}}}
     attributes = attributes if version == "0.4" else {"ome": {"version": version, **attributes}}
     return attributes | ({KEY: dict(provenance)} if provenance else {})
+
+
+def _shown(label: str, voxels: np.ndarray, color: str) -> dict[str, Any]:
+    low, high = display_range(voxels)
+    window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
+    return {"active": True, "color": color, "label": label, "window": window}
 
 
 def _transforms(scale: list[float], first: list[float], side: int) -> list[dict[str, Any]]:
@@ -138,23 +146,22 @@ def _transforms(scale: list[float], first: list[float], side: int) -> list[dict[
 
 
 def missing_chunk(array, place: tuple[int, ...] = ()) -> str | None:
-    """Key of a chunk of an array in a local store, or of the part `array[place]`, that is missing there.
+    """Key of a chunk of an array in its store, or of the part `array[place]`, that is missing there.
 
     Zarr reads its fill value instead, as it does for what a program left out because it is dark.
     """
-    root = Path(array.store.root, array.path)
     sizes = array.shards or array.chunks
     counts = [range(at // size, at // size + 1) for at, size in zip(place, sizes, strict=False)]
     rest = zip(array.shape[len(place) :], sizes[len(place) :], strict=True)
     counts += [range(-(-length // size)) for length, size in rest]
     keys = (array.metadata.encode_chunk_key(chunk) for chunk in itertools.product(*counts))
-    return next((key for key in keys if not (root / key).exists()), None)
+    return next((key for key in keys if not has_key(array, key)), None)
 
 
-def plane_chunks(shape: tuple[int, int, int]) -> dict[str, Any]:
+def plane_chunks(shape: tuple[int, ...]) -> dict[str, Any]:
     """Storage of a volume: each plane, or square of it, is a file."""
     return {
-        "chunks": (1, *_square(shape)),
+        "chunks": (*[1] * (len(shape) - 2), *_square(shape)),
         "compressors": {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1},
         "chunk_key_encoding": {"name": "v2", "separator": "/"},
     }

@@ -26,6 +26,7 @@ from ..base.typing import PathLike
 from ..microscope.grid import Grid
 from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, side_file, write_json
 from .names import plain_text
+from .remote import remote_url
 
 Provenance = Mapping[str, str]
 
@@ -45,7 +46,7 @@ def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> 
             with path.open("rb") as file:
                 table[input_key(path)] = f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()}"
         else:
-            table[input_key(path)] = "a folder"
+            table[input_key(path)] = remote_url(path) or "a folder"
     return table | ({"design": design} if design else {})
 
 

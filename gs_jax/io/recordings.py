@@ -23,8 +23,9 @@ from ..base.typing import PathLike
 from .axes import UNNAMED, axis_letter, stack_error
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
 from .captures import (
-    CAPTURE_SUFFIXES,
     OWN,
+    READ_SUFFIXES,
+    VENDOR_SUFFIXES,
     GreyError,
     Images,
     Selection,
@@ -33,12 +34,14 @@ from .captures import (
     check_declared,
     check_images,
     check_stack,
+    of_channel,
     open_source,
     read_images,
 )
 from .files import TIFF_SUFFIXES, check_input, decoding
 from .names import natural_order
-from .ngff import import_zarr, missing_chunk, ngff_attributes
+from .ngff import missing_chunk, ngff_attributes
+from .remote import import_zarr, open_store, remote_url
 
 _ZARR_ROOTS = (".zarray", ".zgroup", "zarr.json")
 
@@ -62,7 +65,9 @@ class Recording(NamedTuple):
 
 
 @contextlib.contextmanager
-def open_recording(path: PathLike, *, page: int | str | None = None, axes: str = "t") -> Iterator[Recording | None]:
+def open_recording(
+    path: PathLike, *, page: int | str | None = None, axes: str = "t", channel: str | None = None
+) -> Iterator[Recording | None]:
     """Open the frames of a recording, or the planes of a stack; None if the path is a single capture.
 
     Parameters
@@ -70,11 +75,13 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
     path
         A folder, or a pattern with `*`, `?` or `[...]`, whose captures are the frames, in natural order (`f2` before
         `f10`); a TIFF, with the other files of its set, or an .npy of several pages; a Zarr array `(t, y, x)` or
-        `(t, 1, 1, y, x)`, or the OME-Zarr image of one.
+        `(t, 1, 1, y, x)`, or the OME-Zarr image of one, also at an s3:// or https:// address.
     page
         As for `read_capture`: each file is then one frame, and a single file no recording.
     axes
         The axes that may hold the images, if the file names them: "t", or "tz" for stacks.
+    channel
+        As for `read_capture`.
 
     Raises
     ------
@@ -88,17 +95,18 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_dir() and (suffix == ".zarr" or any((path / name).exists() for name in _ZARR_ROOTS)):
+    if remote_url(path) or path.is_dir() and (suffix == ".zarr" or any((path / name).exists() for name in _ZARR_ROOTS)):
         if page is not None:
             raise InputError(f"--page must not be given for a recording in Zarr, got --page {page} ({path}).")
-        yield _recording(path, _zarr_source(path, axes), axes)
+        source = _zarr_source(path, axes)
+        yield _recording(path, of_channel(path, source, channel) if channel else source, axes)
     elif (files := capture_files(path)) is not None:
         yield _open_files(path, files, page)
-    elif page is not None or suffix not in (*TIFF_SUFFIXES, ".npy"):
+    elif page is not None or suffix not in (*TIFF_SUFFIXES, ".npy", *VENDOR_SUFFIXES):
         yield None
     else:
         advice = "; --page takes one image; if all follow each other, save them with the axes TYX"
-        with open_source(check_input(path)) as source:
+        with open_source(check_input(path), channel=channel) as source:
             yield _recording(path, source, axes, advice) if len(source.names) > 1 else None
 
 
@@ -114,6 +122,8 @@ def _recording(path: Path, source: Source, axes: str, advice: str = "") -> Recor
 
 def capture_files(path: Path) -> list[Path] | None:
     """Captures of a folder or a pattern, in natural order; None if the path is neither."""
+    if remote_url(path):
+        return None
     if path.is_dir():
         matches = [path / name for name in os.listdir(path)]
     elif re.search(r"[*?[]", str(path)) and not path.exists():
@@ -125,7 +135,7 @@ def capture_files(path: Path) -> list[Path] | None:
 
 def is_capture(name: str) -> bool:
     """Whether a file of this name is a capture; one whose name begins with a dot may not be complete."""
-    return name.lower().endswith(CAPTURE_SUFFIXES) and not name.startswith(".")
+    return name.lower().endswith(READ_SUFFIXES) and not name.startswith(".")
 
 
 def _pattern(path: Path) -> str:
@@ -140,7 +150,7 @@ def _pattern(path: Path) -> str:
 
 def _open_files(path: Path, files: list[Path], page: int | str | None) -> Recording:
     if not files:
-        raise InputError(f"{path}: no captures; their files end in {', '.join(CAPTURE_SUFFIXES)}.")
+        raise InputError(f"{path}: no captures; their files end in {', '.join(READ_SUFFIXES)}.")
 
     def read(index: int, selection: Selection) -> Images:
         return read_images(files[index], selection._replace(page=OWN if page is None else page))
@@ -151,8 +161,8 @@ def _open_files(path: Path, files: list[Path], page: int | str | None) -> Record
 def _zarr_source(path: Path, allowed: str) -> Source:
     """The images of a Zarr array; `InputError` if there is none, or it is none of `allowed` axes, rows and columns."""
     zarr = import_zarr()
-    with decoding(path, "Zarr store"):
-        store = _only_series(zarr.open(path, mode="r"))
+    with decoding(remote_url(path) or path, "Zarr store"):
+        store = _only_series(open_store(path))
         array = store if isinstance(store, zarr.Array) else _image_array(store)
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: no image; must be a Zarr array (t, y, x), or OME-Zarr of one image.")
@@ -173,7 +183,9 @@ def _zarr_source(path: Path, allowed: str) -> Source:
         return image
 
     frames = [f"{path.name}, frame {frame}" for frame in range(1, math.prod(shape[:-2]) + 1)]
-    return Source(list(zip(names, shape[:-2], strict=False)), shape[-2:], frames, read, [])
+    labels = [channel.get("label", "") for channel in (ngff_attributes(store).get("omero") or {}).get("channels", [])]
+    axes = list(zip(names, shape[:-2], strict=False))
+    return Source(axes, shape[-2:], frames, read, [], labels if all(labels) else ())
 
 
 def _only_series(store):
@@ -234,7 +246,7 @@ def read_spots(
     selection = Selection(None, page, readout.channel, readout.bayer)
     prepared: dict[Any, Prepared] = {}
     for path in paths:
-        with open_recording(path, page=page, axes="tz") as recording:
+        with open_recording(path, page=page, axes="tz", channel=readout.channel) as recording:
             stack = recording or Recording([path.name], lambda _, selected, path=path: read_images(path, selected), [])
             for plane, name in enumerate(stack.names):
                 own = readout

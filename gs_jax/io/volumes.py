@@ -15,12 +15,12 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
-from jaxtyping import Array, Float, Float32, Int, Shaped
+from jaxtyping import Array, Float32, Shaped
 
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
@@ -28,12 +28,12 @@ from ..base.typing import PathLike, Volume
 from ..microscope.grid import Grid
 from .captures import write_npy
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
+from .meshes import Maps, as_ply, surface_mesh
 from .names import mm_per
 from .ngff import (
     display_range,
     first_um,
     image_attributes,
-    import_zarr,
     ngff_attributes,
     plain_depths,
     plane_chunks,
@@ -41,6 +41,7 @@ from .ngff import (
     um,
 )
 from .provenance import Provenance, annotation, moved, surface_of, write_sidecar
+from .remote import import_zarr, open_store, remote_url
 from .tiff import decode_page, decode_plane, open_tiff
 
 VOLUME_SUFFIXES = (*TIFF_SUFFIXES, ".zarr")
@@ -51,10 +52,6 @@ MAX_VOXELS = 10**10
 _DESCRIPTION, _AFTER = 270, 271
 # Channels of a sheet.
 _CHANNELS = ("brightness", "depth_um", "sd_um")
-# Neighbours whose depths differ by more voxels than this lie on different parts of the scene.
-_STEEP = 4
-
-Maps = Float[np.ndarray, "sheet y x"]
 
 
 @host_code()
@@ -97,16 +94,41 @@ def write_volume(
         raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
         raise ValueError("`volume` must be finite, got a NaN or an infinity.")
-    depths = plain_depths(grid)
     if path.suffix.lower() == ".zarr":
-        attributes, zarr = image_attributes(path, depths, grid, 1, voxels, provenance), import_zarr()
-        with atomic_write(path) as temporary:
-            group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
-            array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **plane_chunks(voxels.shape))
-            array[...] = voxels
+        _write_zarr(path, voxels, grid, provenance)
     else:
-        known = {"depths": depths, "pitch": grid.pitch, "first": first_um(grid)}
-        _write_ome(path, voxels, "ZYX", provenance, **known, for_imagej=True)
+        _write_ome(path, voxels, "ZYX", provenance, **_known(grid), for_imagej=True)
+
+
+def write_channels(
+    path: PathLike,
+    volumes: dict[str, Volume],
+    wavelengths: Sequence[float],
+    grid: Grid,
+    provenance: Provenance | None = None,
+) -> None:
+    """Write the volumes of channels by their names as one image `(c, z, y, x)`; as `write_volume`.
+
+    `wavelengths` are theirs, nm, which OME-TIFF has.
+    """
+    path, voxels, names = check_output(path, VOLUME_SUFFIXES), np.stack(list(volumes.values())), list(volumes)
+    if path.suffix.lower() == ".zarr":
+        _write_zarr(path, voxels, grid, provenance, names)
+    else:
+        _write_ome(path, voxels, "CZYX", provenance, **_known(grid), channels=names, wavelengths=wavelengths)
+
+
+def _known(grid: Grid) -> dict[str, Any]:
+    return {"depths": plain_depths(grid), "pitch": grid.pitch, "first": first_um(grid)}
+
+
+def _write_zarr(path: Path, voxels: np.ndarray, grid: Grid, provenance: Provenance | None, channels=()) -> None:
+    zarr = import_zarr()
+    attributes = image_attributes(path, plain_depths(grid), grid, 1, voxels, provenance, channels=channels)
+    with atomic_write(path) as temporary:
+        group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
+        array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **plane_chunks(voxels.shape))
+        array[...] = voxels
 
 
 def read_volume(path: PathLike) -> tuple[Volume, Grid]:
@@ -232,24 +254,30 @@ def _write_ome(
     pitch: float | None = None,
     first: tuple[float, float] | None = None,
     channels: Sequence[str] = (),
+    wavelengths: Sequence[float] = (),
     for_imagej: bool = False,
 ) -> None:
     """Write planes as OME-TIFF, with the depths and the pitch (mm) and the centre of the first voxel (um) if known.
 
-    `channels` are names of planes that are channels; `for_imagej` adds the description of ImageJ, if all is known.
+    `channels` are names along the first of the `axes`, if that is c, and `wavelengths` theirs, nm, if known;
+    `for_imagej` adds the description of ImageJ, if all is known.
     """
+    count = math.prod(planes.shape[:-2])
     # The mean step of uneven depths serves viewers that know one step only; the planes have exact depths.
     step = float(np.mean(np.abs(np.diff(depths)))) if depths is not None and len(depths) > 1 else 0.0
     sizes = {axis: um(length) for axis, length in (("X", pitch), ("Y", pitch), ("Z", step)) if length}
     at = dict(zip("YX", first or (), strict=False))
-    positions = {axis: [at[axis]] * len(planes) for axis in "XY" if axis in at}
-    positions |= {"Z": list(map(um, depths))} if depths is not None else {}
+    positions = {axis: [at[axis]] * count for axis in "XY" if axis in at}
+    positions |= {"Z": list(map(um, depths)) * (count // len(depths))} if depths is not None else {}
     metadata: dict[str, Any] = {"axes": axes, "Name": title(path)}
     metadata |= {f"PhysicalSize{axis}": size for axis, size in sizes.items()}
     metadata |= {f"PhysicalSize{axis}Unit": "µm" for axis in sizes}
     plane = {f"Position{axis}": values for axis, values in positions.items()}
-    plane |= {f"Position{axis}Unit": ["µm"] * len(planes) for axis in positions}
-    metadata |= ({"Plane": plane} if plane else {}) | ({"Channel": {"Name": channels}} if channels else {})
+    plane |= {f"Position{axis}Unit": ["µm"] * count for axis in positions}
+    channel: dict[str, Any] = {"Name": channels} if channels else {}
+    if wavelengths:
+        channel |= {"EmissionWavelength": wavelengths, "EmissionWavelengthUnit": ["nm"] * len(wavelengths)}
+    metadata |= ({"Plane": plane} if plane else {}) | ({"Channel": channel} if channel else {})
     metadata |= annotation(provenance)
     options: dict[str, Any] = {}
     if for_imagej:
@@ -333,13 +361,13 @@ def _ome_length(path: Path, element: ElementTree.Element, name: str) -> float:
 
 
 def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
-    zarr = import_zarr()
-    if not os.path.exists(path):
+    zarr, url = import_zarr(), remote_url(path)
+    if url is None and not os.path.exists(path):
         raise InputError(f"{path}: cannot be read: no such folder.")
-    if not os.path.isdir(path):
+    if url is None and not os.path.isdir(path):
         raise input_error("volume", "a Zarr folder", "a file", path)
-    with decoding(path, "OME-Zarr"):
-        group = zarr.open_group(path, mode="r")
+    with decoding(url or path, "OME-Zarr"):
+        group = open_store(path)
         attributes = ngff_attributes(group)
     name, scale, first = _parse_multiscales(path, attributes)
     with decoding(path, "OME-Zarr"):
@@ -382,14 +410,6 @@ class SurfaceMaps(NamedTuple):
     grid: Grid
 
 
-class Mesh(NamedTuple):
-    """Triangles between lit neighbours of sheets: vertices `(x, y, z)`, mm, and their brightness, from 0 to 1."""
-
-    vertices: Float[np.ndarray, "vertex 3"]
-    brightness: Float[np.ndarray, " vertex"]
-    faces: Int[np.ndarray, "face 3"]
-
-
 def write_surface(
     path: PathLike,
     brightness: Maps,
@@ -424,7 +444,7 @@ def write_surface(
     path = check_output(path, SURFACE_SUFFIXES)
     depth = depth - np.float32(below)
     if path.suffix.lower() == ".ply":
-        data = _ply(surface_mesh(brightness, depth, grid))
+        data = as_ply(surface_mesh(brightness, depth, grid))
         with atomic_write(path) as temporary:
             temporary.write_bytes(data)
         write_sidecar(path, provenance)
@@ -461,29 +481,3 @@ def read_surface(path: PathLike) -> SurfaceMaps:
     first = next(pixels.iterfind("{*}Plane"), ElementTree.Element("Plane"))
     grid = _lateral_grid(path, [middle], maps.shape[1:], pixels, first)
     return SurfaceMaps(brightness, depth + np.float32(surface_of(path)), sd / np.float32(1000), grid)
-
-
-def surface_mesh(brightness: Maps, depth: Maps, grid: Grid) -> Mesh:
-    """Triangles between lit neighbours, of all sheets, but where the depth jumps."""
-    y, x = np.meshgrid(np.asarray(grid.y), np.asarray(grid.x), indexing="ij")
-    number = np.arange(depth.size).reshape(depth.shape)
-    corners = [np.s_[:, :-1, :-1], np.s_[:, :-1, 1:], np.s_[:, 1:, 1:], np.s_[:, 1:, :-1]]
-    around = np.stack([depth[part] for part in corners])
-    # Where it is dark the range is NaN, which is not small.
-    flat = np.ptp(around, axis=0) <= _STEEP * grid.pitch
-    a, b, c, d = (number[part][flat] for part in corners)
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
-    vertices = np.stack([np.broadcast_to(x, depth.shape), np.broadcast_to(y, depth.shape), depth], -1).reshape(-1, 3)
-    light = np.clip(brightness / max(np.percentile(brightness, 99.5), 1e-30), 0, 1).reshape(-1)
-    used, faces = np.unique(faces, return_inverse=True)
-    return Mesh(vertices[used], light[used], faces.reshape(-1, 3))
-
-
-def _ply(mesh: Mesh) -> bytes:
-    """A mesh as PLY, coloured by brightness."""
-    import trimesh  # 0.3 s that images do not need
-
-    grey = (255 * mesh.brightness).astype(np.uint8)
-    colours = np.stack([grey, grey, grey, np.full_like(grey, 255)], -1)
-    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
-    return bytes(cast(bytes, made.export(file_type="ply")))

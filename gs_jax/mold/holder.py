@@ -235,8 +235,9 @@ class Holder:
         if self.depth - (begin := float(self.imager.sample_surface)) < MIN_THICKNESS_MM or self.reach < _COLLAR:
             least = max(begin + MIN_THICKNESS_MM, self.depth - self.reach + _COLLAR)
             yield f"--target-mm must be {least:.4g} or more, beyond the collar and the filters, got {self.depth:g}."
-        if shape.pinhole > (most := self.spread / 2):
-            yield f"--pinhole-um must be at most {1000 * most:.4g}, half of their distance, got {1000 * shape.pinhole:g}."
+        if shape.pinhole > (most := min(self.spread / 2, 1.0)):
+            got = f"got {1000 * shape.pinhole:g} for pinholes {self.spread:g} mm apart"
+            yield f"--pinhole-um must be at most {1000 * most:.4g}, {got}."
 
     @property
     def _mouth(self) -> float:

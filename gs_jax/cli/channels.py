@@ -1,0 +1,72 @@
+"""`gs-jax reconstruct` for several channels of a capture: one image with a volume of each."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import numpy as np
+
+from ..base.errors import InputError, input_error
+from ..base.progress import Progress
+from .commands import given_options, print_warning, provenance_of
+from .options import CaptureOptions, DepthLight, voxels
+
+# Options that must not be given with several channels.
+_ONE_CHANNEL = ("points", "surface", "score", "tiles", "watch", "frame_interval", "track", "warm_start", "resume")
+_ONE_CHANNEL += ("workers", "scheduler", "wavelength_nm", "bayer")
+
+
+def reconstruct_channels(
+    capture: Path,
+    microscope,
+    names: list[str],
+    depths: list[float],
+    voxel_um: float | None,
+    options,
+    output: Path,
+    light: DepthLight,
+    camera: CaptureOptions,
+) -> None:
+    """Reconstruct several channels of a capture, each at its wavelength, on the grid of the first, as one image.
+
+    `options` are `MethodOptions`.
+    """
+    from ..io.provenance import DepthFrame
+    from ..io.recordings import open_recording
+    from ..io.volumes import write_channels
+    from ..reconstruction.plan import Plan
+
+    if given := given_options(_ONE_CHANNEL):
+        raise InputError(f"{given[0]} must be used with one --channel, got {camera.channel}.")
+    if len(set(names)) < len(names):
+        raise input_error("--channel", "different names", camera.channel)
+    if missing := [name for name in names if name not in microscope.channels]:
+        allowed = "in the design, with a wavelength_nm, for --channel of several"
+        raise input_error(f"`channels.{missing[0]}`", allowed, ", ".join(microscope.channels) or "none")
+    cameras = [replace(camera, channel=name) for name in names]
+    with open_recording(capture, page=camera.page, channel=names[0]) as frames:
+        if frames is not None:
+            raise InputError(f"{capture}: must be one image for --channel of several, got {len(frames.names)} frames.")
+    plans, volumes = [], {}
+    with Progress() as progress:
+        lights = [light.of_channel(microscope, name) for name in names]
+        imagers = [one.imager(each.imager(microscope)) for one, each in zip(cameras, lights, strict=True)]
+        images = [one.read(capture) for one in cameras]
+        for name, imager, image in zip(names, imagers, images, strict=True):
+            frame, from_array = DepthFrame(light.origin(imager)), light.from_array(depths, imager)
+            plan = Plan.from_options(imager, from_array, voxel_um and voxel_um / 1000, **vars(options))
+            plans.append(replace(plan, grid=plans[0].grid) if plans else plan)
+            result = plans[-1].prepare(progress)(image, progress)
+            volumes[name] = np.asarray(result.volume)
+            if result.warning:
+                print_warning(f"{name}: {result.warning}")
+        plan, wavelengths = plans[0], [microscope.channels[name].wavelength_nm for name in names]
+        with progress.step("Writing"):
+            provenance = cameras[0].recorded(provenance_of(capture, *camera.files, design=microscope))
+            provenance |= frame.note if plan.imager.sample is not None else {}
+            write_channels(output, volumes, wavelengths, frame.grid(plan.grid), provenance)
+    for one in cameras:
+        one.print_corrections()
+    shape = (len(names), *plan.grid.volume_shape)
+    click.echo(f"{output}: {voxels(shape, 'c, z, y, x', plan.grid.pitch, depths, plan.imager)}")
+    click.echo(f"{output}: {', '.join(f'{n} at {w:g} nm' for n, w in zip(names, wavelengths, strict=True))}")
