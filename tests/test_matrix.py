@@ -31,7 +31,10 @@ from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
 from gs_jax.io.ngff import VolumeSeries
 from gs_jax.microscope.layouts import nearest_neighbour_distances
+from gs_jax.mold.export import float32_mesh
 from gs_jax.mold.heights import write_heights
+from gs_jax.mold.holder import HolderShape, make_rig
+from gs_jax.mold.manufacturability import check_solid
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 from gs_jax.reconstruction.plan import Plan, follow_volume
@@ -412,6 +415,13 @@ def mold(case: Case, folder: Path) -> None:
     assert write_heights(case.design, folder / "heights.dat", step=0.1)["deviation_nm"] < 1
 
 
+def held(case: Case, folder: Path) -> None:
+    rig = make_rig(case.design, HolderShape(flange=case.design.imaging.sensor_distance_mm, bore=60.0, bolts=80.0))
+    for solid, volume in ((rig.holder, rig.holder_volume), (rig.target, rig.target_volume)):
+        results = check_solid(float32_mesh(solid), volume, "part", handles=5)
+        assert all(result.level == "ok" for result in results), results
+
+
 def reported(case: Case, folder: Path) -> None:
     write_report(folder / "report.html", case.design, volume=case.truth, grid=case.grid, points=case.points)
     assert case.design.name in (folder / "report.html").read_text(encoding="utf-8")
@@ -433,6 +443,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     "optimise": optimise,
     "tolerance": tolerances,
     "mold": mold,
+    "holder": held,
     "report": reported,
 }
 # What is refused, and by which words.
@@ -443,6 +454,8 @@ REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
     ("one lens", "pattern"): "a pattern needs an array of 6 lenses or more, got 1",
     ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",
+    ("small lenses", "holder"): "must begin beyond the holder",
+    **{(name, "holder"): "must begin with 1 mm of air" for name in ("layers", "samples", "tilted, layers")},
     ("out of focus", "calibrate"): "of 20 bright spots on lenses",
 }
 # Whatever reads the cores of spots warns.
@@ -467,6 +480,7 @@ ONCE = {
         *("geomscope", "geomscope-asphere", "steep", "aspheric", "two radii", "small lenses", "one lens"),
         "curved, tilted, two radii",
     ),
+    "holder": ("geomscope", "curved side", "endoscope", "layers", "small lenses"),
     "points": ("geomscope-asphere", "one lens"),
     "backproject": ("endoscope",),
     "list-rl": ("curved, tilted, two radii, layers",),

@@ -3,7 +3,9 @@
 import functools
 import http.server
 import os
+import sys
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from click.testing import CliRunner
 import gs_jax as gs
 from gs_jax import InputError
 from gs_jax.__main__ import commands
-from gs_jax.io.captures import read_capture
+from gs_jax.io.captures import Selection, read_capture
 from gs_jax.io.ngff import ngff_attributes
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.recordings import open_recording
@@ -80,17 +82,11 @@ def test_a_channel_of_a_recording_is_read_by_its_name_or_number(tmp_path, name):
         with open_recording(path, channel=channel) as frames:
             assert frames is not None and len(frames.names) == 2
             for frame in range(2):
-                (image,) = frames.images(frame, gs_selection(channel))
+                (image,) = frames.images(frame, Selection(channel=channel))
                 np.testing.assert_array_equal(image, STACK[frame, number])
     with pytest.raises(InputError, match=r"--channel must be .*, or a number from 1, got '(DAPI|none)'"):
         with open_recording(path, channel="DAPI") as frames:
             pass
-
-
-def gs_selection(channel):
-    from gs_jax.io.captures import Selection
-
-    return Selection(channel=channel)
 
 
 def test_hdf5_says_what_is_wrong(tmp_path):
@@ -112,7 +108,7 @@ def test_hdf5_says_what_is_wrong(tmp_path):
 @pytest.mark.parametrize("name", ["a.nd2", "a.czi", "a.lif", "a.h5"])
 def test_a_missing_reader_names_the_extra(tmp_path, name, monkeypatch):
     for package in ("bioio_nd2", "bioio_czi", "bioio_lif", "h5py"):
-        monkeypatch.setitem(__import__("sys").modules, package, None)
+        monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / name).write_bytes(b"anything")
     with pytest.raises(InputError, match=r"pip install 'gs-jax\[bioio\]'"):
         read_capture(tmp_path / name)
@@ -125,10 +121,9 @@ def two_channels(folder):
     """A design with two channels, and a capture of a point in each."""
     design = cropped("geomscope").replace(channels=CHANNELS, refractive_index="PDMS")
     gs.write_design(folder / "my.toml", design)
-    images = [
-        np.asarray(gs.simulate(np.array([[x, 0.2, 20.0, 1.0]]), design.imager(), optics="near", psf="geometric"))
-        for x in (-0.8, 0.6)
-    ]
+    points = [np.array([[x, 0.2, 20.0, 1.0]]) for x in (-0.8, 0.6)]
+    options: dict[str, Any] = {"optics": "near", "psf": "geometric"}
+    images = [np.asarray(gs.simulate(point, design.imager(), **options), np.float32) for point in points]
     for name, image in zip(NAMES, images, strict=True):
         gs.write_capture(folder / f"{name}.tif", image)
     tifffile.imwrite(folder / "both.ome.tif", np.stack(images), metadata={"axes": "CYX", "Channel": {"Name": NAMES}})
@@ -192,7 +187,7 @@ def serve(folder):
 
 
 @pytest.mark.filterwarnings("default")
-def test_zarr_is_read_at_an_https_address(tmp_path, monkeypatch):
+def test_zarr_is_read_at_an_https_address(tmp_path):
     pytest.importorskip("aiohttp", reason="pip install 'gs-jax[zarr]'")
     write_zarr(tmp_path / "a.zarr")
     volume = RNG.random((3, 8, 9)).astype(np.float32)
@@ -202,7 +197,7 @@ def test_zarr_is_read_at_an_https_address(tmp_path, monkeypatch):
         root = f"http://127.0.0.1:{server.server_address[1]}"
         with open_recording(f"{root}/a.zarr", channel="GFP") as frames:
             assert frames is not None and len(frames.names) == 2
-            (image,) = frames.images(1, gs_selection("GFP"))
+            (image,) = frames.images(1, Selection(channel="GFP"))
         np.testing.assert_array_equal(image, STACK[1, 0])
         read, grid = gs.read_volume(f"{root}/v.zarr")
         np.testing.assert_array_equal(read, volume)
@@ -214,7 +209,7 @@ def test_zarr_is_read_at_an_https_address(tmp_path, monkeypatch):
         with open_recording(f"{root}/a.zarr", channel="GFP") as frames:
             assert frames is not None
             with pytest.raises(InputError, match="incomplete: there is no chunk c/1/0/0/0"):
-                list(frames.images(1, gs_selection("GFP")))
+                list(frames.images(1, Selection(channel="GFP")))
     finally:
         server.shutdown()
         server.server_close()
@@ -237,7 +232,7 @@ def test_zarr_is_read_at_an_s3_address(tmp_path, monkeypatch):
         files.put(str(tmp_path / "a.zarr"), "lab/a.zarr", recursive=True)
         with open_recording("s3://lab/a.zarr", channel="mCherry") as frames:
             assert frames is not None
-            (image,) = frames.images(0, gs_selection("mCherry"))
+            (image,) = frames.images(0, Selection(channel="mCherry"))
         np.testing.assert_array_equal(image, STACK[0, 1])
     finally:
         server.stop()
