@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import trimesh
 from click.testing import CliRunner
 
 import gs_jax as gs
@@ -67,39 +66,38 @@ def test_shims_are_standard_ones_and_make_up_what_whole_layers_leave():
 
 
 def test_the_thread_is_that_of_a_c_mount():
-    rig = make_rig(device())
-    mesh = trimesh.Trimesh(*(np.asarray(x) for x in dataclasses.astuple(float32_mesh(rig.holder))), process=False)
-    away = np.hypot(*mesh.vertices[:, :2].T)
-    thread = (mesh.vertices[:, 2] < -0.1) & (mesh.vertices[:, 2] > -3.9) & (away > 12.18)
-    x, y, z = mesh.vertices[thread].T
+    vertices = float32_mesh(make_rig(device()).holder).vertices
+    away = np.hypot(vertices[:, 0], vertices[:, 1])
+    thread = (vertices[:, 2] < -0.1) & (vertices[:, 2] > -3.9) & (away > 12.18)
     assert away[thread].max() == pytest.approx(12.6, abs=1e-3) and away[thread].min() > 12.19
-    # Right-handed: the crest goes up by 25.4 / 32 mm in a turn toward +y.
-    crest = away[thread] > 12.58
-    phase = np.unwrap(np.sort((np.arctan2(y, x) - 2 * math.pi * z * 32 / 25.4)[crest] % (2 * math.pi)))
-    assert np.ptp(phase) < 1 or np.ptp((phase + 3) % (2 * math.pi)) < 1
+    # Right-handed: the crest goes up by 25.4 / 32 mm in a turn from +x toward +y.
+    x, y, z = vertices[thread & (away > 12.58)].T
+    assert abs(np.exp(1j * (np.arctan2(y, x) - 2 * math.pi * z * 32 / 25.4)).mean()) > 0.95
+    assert abs(np.exp(1j * (np.arctan2(y, x) + 2 * math.pi * z * 32 / 25.4)).mean()) < 0.5
 
 
-def test_the_command_writes_all_files(tmp_path, monkeypatch):
+@pytest.mark.parametrize("suffix", ["3mf", "stl"])
+def test_the_command_writes_all_files(tmp_path, monkeypatch, suffix):
     monkeypatch.chdir(tmp_path)
     gs.write_design("my.toml", device())
-    line = "holder my.toml --flange-mm 11.5 --bore-mm 30 --bolts-mm 44 -o rig.3mf"
-    result = CliRunner().invoke(commands, line.split())
+    line = "holder my.toml --flange-mm 11.5 --bore-mm 30 --bolts-mm 44 -o"
+    result = CliRunner().invoke(commands, [*line.split(), f"rig.{suffix}"])
     assert result.exit_code == 0, result.output
     assert "[ok] shims: 100 um" in result.output and "rig-target.csv: in mm" in result.output
-    report = json.loads((tmp_path / "rig.3mf.json").read_text())
+    report = json.loads((tmp_path / f"rig.{suffix}.json").read_text())
     assert report["shims_mm"] == [0.1] and report["provenance"]["command"].startswith("gs-jax holder")
     points, captures = read_positions("rig-target.csv", ["target.tif"])
     assert (captures == 0).all() and (points[:, 2] == report["target_depth_mm"]).all() and (points[0, :2] == 0).all()
     # The pinholes of the mesh are where the table says, and as deep.
-    mesh = read_mesh("rig-target.3mf")
+    mesh = read_mesh(f"rig-target.{suffix}")
     front = report["printed_step_mm"]
     rim = mesh.vertices[np.isclose(mesh.vertices[:, 2], front + points[0, 2], atol=1e-4)]
     for x, y, _ in points:
         assert np.hypot(rim[:, 0] - x, rim[:, 1] - y).min() == pytest.approx(0.05, abs=1e-4)
-    for name in ("rig.3mf", "rig-target.3mf", "rig-target.csv"):
+    for name in (f"rig.{suffix}", f"rig-target.{suffix}", "rig-target.csv"):
         assert read_provenance(name)["input my.toml"].startswith("sha256")
-    assert (tmp_path / "rig.3mf.png").stat().st_size > 10_000
-    again = CliRunner().invoke(commands, line.split())
+    assert (tmp_path / f"rig.{suffix}.png").stat().st_size > 10_000
+    again = CliRunner().invoke(commands, [*line.split(), f"rig.{suffix}"])
     assert isinstance(again.exception, InputError) and "--force" in str(again.exception)
 
 

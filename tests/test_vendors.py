@@ -178,7 +178,7 @@ def serve(folder):
     """A server of a folder on the loopback interface."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_) -> None:
+        def log_message(self, format, *args) -> None:
             pass
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))

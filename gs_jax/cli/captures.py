@@ -115,7 +115,7 @@ def calibrate_command(
     names = [name for name in (*fitted, *(["scale"] if pattern else []), *fit) if name not in hold]
     of_sample = from_scene or light.depths_from == "sample" or not set(names).isdisjoint(OF_SAMPLE)
     light = _with_sample(light, microscope, default="sample" if of_sample else "air")
-    imager = camera.imager(light.imager(microscope))
+    imager = camera.imager(light.of_channel(microscope, camera.channel).imager(microscope))
     with Progress() as progress:
         if from_scene:
             capture = next(iter(captures))

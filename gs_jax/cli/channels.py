@@ -51,9 +51,9 @@ def reconstruct_channels(
     with Progress() as progress:
         lights = [light.of_channel(microscope, name) for name in names]
         imagers = [one.imager(each.imager(microscope)) for one, each in zip(cameras, lights, strict=True)]
+        frame, from_array = DepthFrame(light.origin(imagers[0])), light.from_array(depths, imagers[0])
         images = [one.read(capture) for one in cameras]
         for name, imager, image in zip(names, imagers, images, strict=True):
-            frame, from_array = DepthFrame(light.origin(imager)), light.from_array(depths, imager)
             plan = Plan.from_options(imager, from_array, voxel_um and voxel_um / 1000, **vars(options))
             plans.append(replace(plan, grid=plans[0].grid) if plans else plan)
             result = plans[-1].prepare(progress)(image, progress)

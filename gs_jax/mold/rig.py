@@ -15,7 +15,7 @@ from ..base.typing import PathLike
 from ..design.design import Design
 from ..io.files import check_output, side_file, write_figure, write_json
 from ..io.point_tables import write_rows
-from ..io.provenance import KEY, Provenance, sidecar
+from ..io.provenance import KEY, Provenance, sidecar, write_sidecar
 from .export import MESH_SUFFIXES, float32_mesh, write_mesh
 from .holder import AIR_NAMES, Holder, HolderShape, Rig, make_rig
 from .lenslets import Part
@@ -27,11 +27,12 @@ _COLORS = {"holder": "#90a4ae", "target": "#ffcc80", "array": "#4fc3f7", "window
 
 
 def rig_files(path: PathLike) -> list[Path]:
-    """What is written beside a holder: the target, its table of pinholes and where that comes from, picture, report."""
+    """What is written beside a holder: target, pinholes, picture, report, and where the first two come from."""
     path = Path(path)
     target = path.with_name(f"{path.stem}-target{path.suffix}")
     places = target.with_suffix(".csv")
-    return [target, places, sidecar(places), side_file(path, ".png"), side_file(path, ".json")]
+    beside = [sidecar(places), *([sidecar(target)] if path.suffix.lower() == ".stl" else [])]
+    return [target, places, side_file(path, ".png"), side_file(path, ".json"), *beside]
 
 
 def write_rig(
@@ -51,7 +52,7 @@ def write_rig(
     """
     progress = progress or Progress()
     path = check_output(path, MESH_SUFFIXES)
-    target, places, _, picture, record = (check_output(beside, [beside.suffix]) for beside in rig_files(path))
+    target, places, picture, record, *_ = (check_output(beside, [beside.suffix]) for beside in rig_files(path))
     design, _ = open_design(design)
     with progress.step("Building and checking the solids"):
         rig = make_rig(design, shape)
@@ -68,6 +69,8 @@ def write_rig(
     with progress.step("Writing"):
         for file, (name, mesh) in meshes.items():
             write_mesh(file, mesh, f"{design.name} {name}", provenance)
+        if path.suffix.lower() == ".stl":
+            write_sidecar(target, provenance)
         rows = ((1, *place) for place in rig.places.tolist())
         write_rows(places, ["capture", "x_mm", "y_mm", "z_mm"], rows, provenance)
         write_figure(picture, draw_rig(design, shape, rig))
