@@ -25,18 +25,19 @@ def import_zarr() -> Any:
     return zarr
 
 
-def open_store(path: PathLike) -> Any:
-    """Open the array or group of a store for reading.
+def open_store(path: PathLike, *, group: bool = False) -> Any:
+    """Open the array or group of a store, or a group alone, for reading.
 
     Raises `InputError` if a package for it is not installed, and what zarr raises if there is none.
     """
     zarr, url = import_zarr(), remote_url(path)
+    opener = zarr.open_group if group else zarr.open
     if url is None:
-        return zarr.open(path, mode="r")
+        return opener(path, mode="r")
     with needs_extra("zarr"):
         for package in ("fsspec", "s3fs" if url.startswith("s3") else "aiohttp"):
             import_module(package)
-    return zarr.open(url, mode="r")
+    return opener(url, mode="r")
 
 
 def has_key(array: Any, key: str) -> bool:

@@ -367,7 +367,7 @@ def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
     if url is None and not os.path.isdir(path):
         raise input_error("volume", "a Zarr folder", "a file", path)
     with decoding(url or path, "OME-Zarr"):
-        group = open_store(path)
+        group = open_store(path, group=True)
         attributes = ngff_attributes(group)
     name, scale, first = _parse_multiscales(path, attributes)
     with decoding(path, "OME-Zarr"):
