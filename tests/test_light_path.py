@@ -46,6 +46,7 @@ def design_of(changes) -> Design:
         ("BK7", 486.13, 1.52238),
         ("fused silica", 587.56, 1.45846),
         ("PMMA", 587.56, 1.4911),
+        ("polystyrene", 587.6, 1.5917),
         ("water", 589.3, 1.3332),
         ("PDMS", 589.3, 1.4118),  # data sheet of Sylgard 184
         ("air", 520.0, 1.0),

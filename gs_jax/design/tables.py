@@ -57,7 +57,7 @@ Centers = Annotated[
     tuple[Point, ...],
     _allowed(f"[x, y] in mm, of 1 to {MAX_LENSES} lenses, or `centers_file`", min_length=1, max_length=MAX_LENSES),
 ]
-Material = Literal["air", "PDMS", "PMMA", "BK7", "fused silica", "water"]
+Material = Literal["air", "PDMS", "PMMA", "polystyrene", "BK7", "fused silica", "water"]
 _NAMES = ", ".join(f'"{name}"' for name in MATERIALS if name != "air")
 Index = Annotated[
     Annotated[Material, Tag(NAME)] | Annotated[float, Field(ge=1, le=5), Tag(ONE)],

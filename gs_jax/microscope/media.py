@@ -56,8 +56,9 @@ MATERIALS = {
     # Sylgard 184, 10:1: V. Gupta et al., ACS Appl. Mater. Interfaces 11, 28189 (2019). Our fit to their table, to 5e-7.
     # It gives 1.4114 at 589 nm; the data sheet of Sylgard 184 has 1.4118. The GEOMScope paper takes 1.43.
     "PDMS": Material(_cauchy((1.402892, 2.43441e-3, 1.83519e-4)), 300.0, 1200.0),
-    # N. Sultanova, S. Kasarova, I. Nikolov, Acta Phys. Pol. A 116, 585 (2009).
+    # Both of N. Sultanova, S. Kasarova, I. Nikolov, Acta Phys. Pol. A 116, 585 (2009).
     "PMMA": Material(_sellmeier((1.1819, 0.011313)), 436.8, 1052.0),
+    "polystyrene": Material(_sellmeier((1.4435, 0.020216)), 436.8, 1052.0),
     # N-BK7: catalogue of Schott.
     "BK7": Material(
         _sellmeier((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)), 300.0, 2500.0
@@ -88,7 +89,7 @@ def refractive_index(material: str, wavelength_nm: float) -> float:
     Parameters
     ----------
     material
-        "PDMS", "PMMA", "BK7" (N-BK7), "fused silica", "water" or "air".
+        "PDMS", "PMMA", "polystyrene", "BK7" (N-BK7), "fused silica", "water" or "air".
     wavelength_nm
         In air, nm.
 
