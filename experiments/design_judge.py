@@ -56,7 +56,8 @@ class Settings(NamedTuple):
     `sensor` is the width of the sensor's middle; lenses beyond it by 0.4 mm are left out. None is the whole device.
     `rays` go from each tile of the scene to each lens: with 600, the images of `geomscope` differed by 5 % (letters)
     and 11 % (beads) from those with 10,000, and with 2,400 by 2 and 4 %. `width`: of the unrolled inversion's voxels,
-    relative to those that are scored; pixels are binned to it. `images`: a key of `IMAGES`.
+    relative to those that are scored; pixels are binned to it. `images`: a key of `IMAGES`. `scale`: of the scenes and
+    voxels, beside those described here; `field` and `sensor` are those of a scale of 1.
     """
 
     span: tuple[float, float] = (18.0, 23.0)
@@ -69,17 +70,18 @@ class Settings(NamedTuple):
     rays: int = 1_200
     width: float = 1.0
     images: str = "rays"
+    scale: float = 1.0
 
     @property
     def depths(self) -> np.ndarray:
-        """Depths of the scenes: the middle, and 0.4 mm from both ends."""
-        return np.array([self.span[0] + 0.4, sum(self.span) / 2, self.span[1] - 0.4])
+        """Depths of the scenes: the middle, and 0.4 mm from both ends, times the scale."""
+        return np.array([self.span[0] + 0.4 * self.scale, sum(self.span) / 2, self.span[1] - 0.4 * self.scale])
 
     @property
     def grid(self) -> gs.Grid:
-        planes = PLANE * np.arange(-self.around, self.around + 1)
+        planes = self.scale * PLANE * np.arange(-self.around, self.around + 1)
         count = round(self.field / VOXEL) | 1
-        return gs.Grid(np.add.outer(self.depths, planes).ravel(), (count, count), VOXEL)
+        return gs.Grid(np.add.outer(self.depths, planes).ravel(), (count, count), self.scale * VOXEL)
 
 
 class Scene(NamedTuple):
@@ -92,6 +94,11 @@ class Scene(NamedTuple):
 
 def make_scene(kind: str, draw: int, settings: Settings = Settings()) -> Scene:
     """A scene of a kind; each draw has other places."""
+    if settings.scale != 1:
+        unit = settings._replace(span=tuple(np.divide(settings.span, settings.scale)), scale=1.0)
+        emitters, points, bars = make_scene(kind, draw, unit)
+        lengths = np.array([settings.scale] * 3 + [1])
+        return Scene(emitters * lengths, points * settings.scale, bars * settings.scale)
     rng = np.random.default_rng([draw, KINDS.index(kind)])
     half, turn = settings.field / 2, rng.uniform(0, 2 * np.pi)
     third = turn + 2 * np.pi / 3 * np.arange(3)
@@ -156,7 +163,7 @@ def image_of(scene: Scene, imager: gs.Imager, settings: Settings) -> np.ndarray:
     light[:, 3] /= light[:, 3].sum()
     if settings.images == "model":
         return image_by_model(light, imager, finer(settings.grid, settings.width))
-    return diffracted(traced(light, imager, settings.rays, TILE), imager)
+    return diffracted(traced(light, imager, settings.rays, settings.scale * TILE), imager)
 
 
 def image_by_model(emitters: np.ndarray, imager: gs.Imager, grid: gs.Grid) -> np.ndarray:
@@ -246,7 +253,8 @@ def scores(volume: np.ndarray, truth: np.ndarray, scene: Scene, grid: gs.Grid) -
 def contrast(volume: np.ndarray, bar: np.ndarray, grid: gs.Grid) -> float:
     """Amplitude of the bars' period over the mean, in the plane of the bars."""
     plane = volume[np.abs(np.asarray(grid.depths) - bar[2]).argmin()]
-    x, y = np.asarray(grid.x) - bar[0], np.asarray(grid.y) - bar[1]
+    scale = float(grid.pitch) / VOXEL
+    x, y = (np.asarray(grid.x) - bar[0]) / scale, (np.asarray(grid.y) - bar[1]) / scale
     lines = plane[np.abs(y) < 0.4 * SIZE][:, near := np.abs(x) < SIZE / 2].mean(0)
     wave = np.exp(2j * np.pi * x[near] / PERIOD)
     # Without the mean of the wave, which is not of whole periods on the voxels.
@@ -265,7 +273,8 @@ def judged(
         image = image.astype(np.float32)
         record: dict[str, Any] = {n: scores(v, truth, scene, grid) for n, v in methods.volumes(image).items()}
         if len(scene.points):
-            record["f1"] = gs.localization(gs.find_points(image, imager, grid), scene.points).f1
+            found, scale = gs.find_points(image, imager, grid), methods.settings.scale
+            record["f1"] = gs.localization(found, scene.points, lateral=0.1 * scale, axial=0.4 * scale).f1
         records[str(exposure)] = record
     return records
 
