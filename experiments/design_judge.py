@@ -7,8 +7,11 @@ Volumes are on the same grid for all, three planes about each depth. Scores, aft
 contrast of bars of 60 um over that of the truth; F1 of beads. Intervals are by a bootstrap over squares of 0.7 mm. A
 second table has what the full model leaves of images without noise, unless it makes the images (`--images model`).
 
-    python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--exposures 3000]
+    python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--scale 0.4] [--draws 2] [--exposures 3000]
         [--rays 1200] [--width 1.0] [--images {rays,model}] [--records FILE]
+
+Lengths of scenes and voxels are for the paper's microscope, times the scale. Exposures are electrons in the brightest
+pixel of the first design.
 
 Writes the records after each scene, from which the next run goes on, and then `design_judge.md`. A scene and an
 exposure of `geomscope-optimized` took four and a half minutes of a loaded core of an AMD EPYC, compilation included.
@@ -337,7 +340,7 @@ def mean_of(records: dict, key: str, exposure: int, read) -> float:
 
 
 def rows_of(by_design: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...], list[list[str]]]:
-    """PSNR by each method, SSIM by the second, F1 or contrast; differences from the reference with intervals."""
+    """PSNR by each method, SSIM by the last, F1 or contrast; by each method, differences from the first design."""
     names, first, method, rows = list(by_design), next(iter(by_design)), settings.methods[-1], []
     for kind in settings.kinds:
         for exposure in settings.exposures:
@@ -351,8 +354,10 @@ def rows_of(by_design: dict[str, dict], settings: Settings) -> tuple[tuple[str, 
                 if kind == "letters":
                     cell += f", bars {read(lambda r: r[method]['contrast']):.2f}"
                 if name != first:
-                    more, low, high = difference(by_design[name], by_design[first], kind, exposure, method)
-                    cell += f" ({more:+.1f}: {low:+.1f} to {high:+.1f})"
+                    gains = (difference(by_design[name], by_design[first], kind, exposure, m) for m in settings.methods)
+                    cell += (
+                        " (" + " / ".join(f"{more:+.1f}: {low:+.1f} to {high:+.1f}" for more, low, high in gains) + ")"
+                    )
                 row.append(cell)
             rows.append(row)
     return ("scene", "electrons", *names), rows
@@ -361,6 +366,7 @@ def rows_of(by_design: dict[str, dict], settings: Settings) -> tuple[tuple[str, 
 def report(
     designs: list[Path],
     span: list[float],
+    scale: float,
     draws: int,
     exposures: list[int],
     rays: int,
@@ -370,12 +376,16 @@ def report(
     progress: gs.Progress,
 ) -> Report:
     # Planes about the three depths must not meet.
-    if draws < 1 or rays < 1 or min(exposures) < 1 or not 0 < span[0] < span[1] - 2:
-        wanted = "--draws, --exposures and --rays must be 1 or more, and --span positive and wider than 2 mm"
-        raise gs.InputError(f"{wanted}, got {draws}, {exposures}, {rays} and {span}.")
-    settings = Settings((span[0], span[1]), exposures=tuple(exposures), rays=rays, width=width, images=images)
+    if draws < 1 or rays < 1 or min(exposures) < 1 or not (scale > 0 and 0 < span[0] < span[1] - 2 * scale):
+        wanted = (
+            "--draws, --exposures and --rays must be 1 or more, and --span positive and wider than 2 mm times --scale"
+        )
+        raise gs.InputError(f"{wanted}, got {draws}, {exposures}, {rays}, {span} and {scale}.")
+    settings = Settings(
+        (span[0], span[1]), exposures=tuple(exposures), rays=rays, width=width, images=images, scale=scale
+    )
     files = designs or [design_file(name) for name in DESIGNS]
-    reference = gs.read_design(design_file(DESIGNS[0])).imager()
+    reference = gs.read_design(files[0]).imager()
     imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
@@ -395,6 +405,7 @@ if __name__ == "__main__":
         {
             "designs": {"type": Path, "nargs": "*"},
             "--span": {"type": float, "nargs": 2, "default": [18.0, 23.0]},
+            "--scale": {"type": float, "default": Settings().scale},
             "--draws": {"type": int, "default": 1},
             "--exposures": {"type": int, "nargs": "+", "default": Settings().exposures},
             "--rays": {"type": int, "default": Settings().rays},

@@ -42,6 +42,16 @@ def test_scenes_lie_on_the_grid_at_all_three_depths(kind):
     assert not np.array_equal(scene.emitters, make_scene(kind, 2, settings).emitters)
 
 
+def test_scenes_of_a_scale_are_those_of_another_span_with_shorter_lengths():
+    small, large = Settings((3.0, 6.0), scale=0.5), Settings((6.0, 12.0))
+    for part, other in zip(make_scene("letters", 0, small), make_scene("letters", 0, large), strict=True):
+        np.testing.assert_allclose(part[:, :3], other[:, :3] / 2)
+    np.testing.assert_allclose(small.grid.depths, large.grid.depths / 2, rtol=1e-6)
+    volume = np.asarray(rasterize(make_scene("letters", 0, large).emitters, large.grid), float)
+    bar = make_scene("letters", 0, large).bars[1]
+    assert contrast(volume, bar / 2, small.grid) == pytest.approx(contrast(volume, bar, large.grid), rel=1e-3)
+
+
 def test_the_contrast_of_bars_falls_with_blur():
     settings = Settings()
     scene = make_scene("letters", 0, settings)
@@ -108,12 +118,14 @@ def test_records_of_an_earlier_version_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"draws": 0}, {"rays": 0}, {"exposures": [3000, 0]}, {"span": [0.0, 5.0]}, {"span": [18.0, 20.0]}]
+    "wrong",
+    [{"draws": 0}, {"rays": 0}, {"exposures": [3000, 0]}, {"scale": 0.0}, {"span": [0.0, 5.0]}, {"span": [18.0, 20.0]}],
 )
 def test_numbers_out_of_range_are_refused_before_anything_is_written(tmp_path, wrong):
     right = {
         "designs": [],
         "span": [18.0, 23.0],
+        "scale": 1.0,
         "draws": 1,
         "exposures": [3000],
         "rays": 10,
