@@ -192,7 +192,7 @@ def cropped(imager: Imager, pixels: int, reach: float) -> Imager:
     """The middle of a sensor, and the lenses so near to it, mm."""
     centers = np.asarray(imager.array.centers)
     near = np.hypot(*centers.T) < reach
-    own = {name: value[near] for name in EACH if (value := np.asarray(getattr(imager.array, name))).ndim}
-    array = dataclasses.replace(imager.array, centers=centers[near], **own)
+    own = {name: np.asarray(imager.array.of_lenses(name))[near] for name in EACH if getattr(imager.array, name).ndim}
+    array = dataclasses.replace(imager.array, centers=centers[near], types=None, **own)
     sensor = Sensor((pixels, pixels), imager.sensor.pixel_pitch)
     return eqx.tree_at(lambda i: (i.array, i.sensor), imager, (array, sensor))

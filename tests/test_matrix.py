@@ -29,6 +29,7 @@ from gs_jax.base.workers import Workers
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
+from gs_jax.design.tables import LENS_KEYS
 from gs_jax.io.ngff import VolumeSeries
 from gs_jax.microscope.layouts import nearest_neighbour_distances
 from gs_jax.mold.export import float32_mesh
@@ -57,9 +58,11 @@ def cropped(name: str, *, lenses: int = LENSES, shape=(PIXELS, PIXELS), **tables
     centers = np.array(design.array.centers_mm)
     data, field = design.model_dump(), design.imaging.field_radius_mm
     away = np.abs(centers).max(1)
-    nearest = centers[np.argsort(away, kind="stable")][: np.sum(away < PLATE * field / 2)]
+    nearest = np.argsort(away, kind="stable")[: np.sum(away < PLATE * field / 2)][:lenses]
     data["sensor"] = {"shape": shape, "pixel_pitch_um": round(1000 * PIXEL_PITCH * field, 4)}
-    data["array"] |= {"centers_mm": nearest[:lenses].tolist(), "size_mm": (PLATE * field, PLATE * field)}
+    data["array"] |= {"centers_mm": centers[nearest].tolist(), "size_mm": (PLATE * field, PLATE * field)}
+    own = {key: data["lens"][key] for key in LENS_KEYS if isinstance(data["lens"][key], tuple)}
+    data["lens"] |= {key: [values[lens] for lens in nearest] for key, values in own.items()}
     for table, values in tables.items():
         data[table] |= values
     return Design.model_validate(data)
