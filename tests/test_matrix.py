@@ -60,7 +60,7 @@ def cropped(name: str, *, lenses: int = LENSES, shape=(PIXELS, PIXELS), **tables
     away = np.abs(centers).max(1)
     nearest = np.argsort(away, kind="stable")[: np.sum(away < PLATE * field / 2)][:lenses]
     data["sensor"] = {"shape": shape, "pixel_pitch_um": round(1000 * PIXEL_PITCH * field, 4)}
-    data["array"] |= {"centers_mm": centers[nearest].tolist(), "size_mm": (PLATE * field, PLATE * field)}
+    data["array"] |= {"centers_mm": centers[nearest].tolist(), "size_mm": (round(PLATE * field, 6),) * 2}
     own = {key: data["lens"][key] for key in LENS_KEYS if isinstance(data["lens"][key], tuple)}
     data["lens"] |= {key: [values[lens] for lens in nearest] for key, values in own.items()}
     for table, values in tables.items():
