@@ -17,7 +17,7 @@ from gs_jax.apps.benchmark import render_points
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Row, TermTable
 from gs_jax.codesign.terms import Objective, Term, evaluate
-from gs_jax.detection.particles import MEMORY, find_clusters, link_particles
+from gs_jax.detection.particles import MEMORY, find_clusters, link_particles, tracks_table
 from gs_jax.io.point_tables import read_points
 
 from .test_recording import bead_frames, command
@@ -147,6 +147,34 @@ def test_who_is_gone_for_long_is_somebody_else():
 
 
 @needs_trackpy
+def test_along_z_particles_may_be_lost_less_easily():
+    """Points whose depths are eight times less certain, 0.5 mm apart: a ball that holds the error holds others, too."""
+    rng, still = np.random.default_rng(0), np.array([[0.5 * (i % 4), 0.5 * (i // 4), 20.0] for i in range(16)])
+    frames = [still + rng.normal(0, (0.02, 0.02, 0.16), still.shape) for _ in range(30)]
+    assert len(set(np.concatenate(list(link_particles(frames, 0.2))))) > 16
+    assert all(list(row) == list(range(16)) for row in link_particles(frames, (0.2, 1.2)))
+    gone = [still, *[np.zeros((0, 3))] * 4, still]
+    assert set(list(link_particles(gone, 0.2, memory=4))[-1]) == set(range(16))
+    assert not set(list(link_particles(gone, 0.2, memory=3))[-1]) & set(range(16))
+
+
+def test_tracks_are_measured():
+    """By hand, of points in any order: one that goes 3, 4 and 0 along x, y and z, then 12 along z, and one alone."""
+    frames, particles = np.array([6, 0, 2, 3]), np.array([5, 5, 7, 5])
+    positions = np.array([[3.0, 4, 32], [0, 0, 20], [1, 1, 20], [3, 4, 20]])
+    table = tracks_table(frames, particles, positions, 0.5)
+    expected = {"particle": [5, 7], "points": [3, 1], "first_frame": [0, 2], "last_frame": [6, 2]}
+    expected |= {"duration_s": [3, 0], "path_mm": [17, 0], "speed_mm_s": [17 / 3, np.nan], "lateral_path_mm": [5, 0]}
+    expected |= {"lateral_speed_mm_s": [5 / 3, np.nan], "displacement_mm": [13, 0]}
+    assert list(table) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_allclose(table[name], values, err_msg=name)
+    assert tracks_table(frames, particles, positions)["speed_mm_frame"][0] == pytest.approx(17 / 6)
+    nobody = tracks_table(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
+    assert all(len(column) == 0 for column in nobody.values())
+
+
+@needs_trackpy
 def test_crowds_are_refused():
     crowd = np.random.default_rng(0).uniform(0, 0.1, (200, 3))
     with pytest.raises(InputError, match="--track: too many particles are within 1000 um"):
@@ -159,7 +187,7 @@ def test_beads_of_a_recording(folder, run):
     (folder / "frames").mkdir()
     for frame, image in enumerate(bead_frames([(-0.3 + 0.05 * t, 0.3)[: 1 if t == 2 else 2] for t in range(5)])):
         tifffile.imwrite(f"frames/{frame}.tif", image[:50] if frame == 3 else image)
-    how = ("--suppress", "clusters", "--points", "p.csv", "--track", "120", "--depths", "20")
+    how = ("--suppress", "clusters", "--points", "p.csv", "--track", "120,400", "--depths", "20")
     status, out, err = run(*command("frames", *how))
     assert status == 1 and "p.csv: 7 points of 2 particles" in out, (out, err)
     header, *rows = (folder / "p.csv").read_text().splitlines()
@@ -169,6 +197,15 @@ def test_beads_of_a_recording(folder, run):
     assert moving[:, 4].tolist() == [0, 1, 2, 4] and still[:, 4].tolist() == [0, 1, 4]
     assert np.ptp(moving[:, 0]) == pytest.approx(0.2, abs=0.06) and np.ptp(still[:, 0]) < 0.06
     assert read_points(folder / "p.csv").shape == (7, 4)
+    header, *rows = (folder / "p.csv.tracks.csv").read_text().splitlines()
+    assert header.startswith("particle,points,first_frame,last_frame,duration_frames,path_mm,speed_mm_frame,")
+    tracks = np.array([row.split(",") for row in rows], float)
+    assert tracks[:, 1].tolist() in ([4, 3], [3, 4]) and tracks[:, 4].tolist() == [4, 4]
+    assert (folder / "p.csv.tracks.png").read_bytes()[:4] == b"\x89PNG"
+    # A table that a person may have changed is not replaced.
+    (folder / "p.csv").unlink()
+    status, _, err = run(*command("frames", *how, "--resume"))
+    assert status == 2 and "p.csv.tracks.csv: the output must be a new file" in err
 
 
 def test_what_cannot_be_tracked_is_one_line(folder, run, monkeypatch):
@@ -177,6 +214,13 @@ def test_what_cannot_be_tracked_is_one_line(folder, run, monkeypatch):
     assert status == 2 and "--track must be used with --points POINTS.csv, which has the particles." in err
     status, _, err = run(*command("capture.tif", "--track", "100", "--points", "p.csv"))
     assert status == 2 and "--track must be used with a recording" in err
+    for words, message in (
+        (("--track", "100,200,300"), "must be XY or XY,Z in um, got '100,200,300'."),
+        (("--track", "100,far"), "got 'far'"),
+        (("--track-memory", "3"), "--track-memory must be used with --track."),
+    ):
+        status, _, err = run(*command("rec.tif", *words, "--points", "p.csv"))
+        assert status == 2 and message in err and err.count("\n") == 1
     monkeypatch.setitem(sys.modules, "trackpy", None)
     status, _, err = run(*command("rec.tif", "--track", "100", "--points", "p.csv"))
     assert (status, err) == (2, "gs-jax: trackpy is not installed; it comes with pip install 'gs-jax[track]'.\n")

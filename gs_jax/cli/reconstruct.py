@@ -161,8 +161,13 @@ def reconstruct_command(
         if not points:
             raise InputError("--track must be used with --points POINTS.csv, which has the particles.")
         import_linker()
+    elif recording.track_memory is not None:
+        raise InputError("--track-memory must be used with --track.")
+    tracks = recording.track_files(points) if points else []
+    for path in tracks:
+        check_output(path, [path.suffix])
     inputs = (capture, design, options.weights, *camera.files)
-    check_may_write(None if recording.resume else output, points, surface, inputs=inputs, force=force)
+    check_may_write(None if recording.resume else output, points, surface, *tracks, inputs=inputs, force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)

@@ -19,19 +19,30 @@ from ..base.errors import InputError, InputWarning
 from ..base.machine import accelerator, copy_to
 from ..base.progress import Progress
 from ..base.workers import Workers
+from ..io.files import side_file, write_figure
 from .commands import RESUMABLE, OptionGroup, given_options, partial_outputs, plural, print_warning, provenance_of
-from .options import CaptureOptions, Number, Um, objects_in, voxels
+from .options import CaptureOptions, Number, Parsed, objects_in, voxels
 
 # Options that must not be given with tiles.
-_WHOLE = ("points", "surface", "score", "suppress", "stop_at_noise", "watch", "frame_interval", "track", "warm_start")
+_WHOLE = ("points", "surface", "score", "suppress", "stop_at_noise")
+_WHOLE += ("watch", "frame_interval", "track", "track_memory", "warm_start")
 # Failed frames that are named; others are only counted, and listed in the journal.
 _MAX_NAMED = 10
 # Options that do not change the volumes.
-_OTHER_OPTIONS = ("capture", "design", "output", "points", "track", "resume", "watch", "force", "workers", "scheduler")
+_OTHER_OPTIONS = ("capture", "design", "output", "points", "track", "track_memory", "resume", "watch", "force")
+_OTHER_OPTIONS += ("workers", "scheduler")
 # The table of points is written again after this multiple of the time that it took last, and seconds at least.
 _SHARE, _PAUSE = 20, 1.0
 # Seconds for which a thread keeps the interpreter: a tenth of the default, so that threads wait shorter for each other.
 _SWITCH = 5e-4
+
+
+def _search_range(text: str) -> tuple[float, ...]:
+    um = Number(1e-2, 1e6, "um", usual=(0.1, 2e4))
+    ranges = tuple(um.convert(part, None, None) for part in text.split(","))
+    if len(ranges) > 2:
+        raise click.BadParameter(f"must be XY or XY,Z in um, got {text!r}.")
+    return ranges
 
 
 @dataclass
@@ -42,8 +53,11 @@ class RecordingOptions(OptionGroup):
         watch: CAPTURE is a folder into which a camera writes: reconstruct each capture as it comes, the newest first,
             to VOLUME.zarr, until Ctrl-C. Needs pip install 'gs-jax[live]'.
         frame_interval: Recordings: seconds between frames, the scale of the time axis. [default: unknown]
-        track: Recordings with --points: largest displacement of a particle between frames, um; POINTS.csv gets a
-            column of particle numbers. Needs pip install 'gs-jax[track]'.
+        track: Recordings with --points: largest displacement of a particle between frames, um, or two of them,
+            laterally and along z, where points are 3 to 10 times less certain. POINTS.csv gets a column of particle
+            numbers, and beside it are written POINTS.csv.tracks.csv, with the duration, path and mean speed of each,
+            and a picture, POINTS.csv.tracks.png. Needs pip install 'gs-jax[track]'.
+        track_memory: Frames from which a particle may be missing and keep its number. [default: 2]
         warm_start: Recordings by list-rl or richardson-lucy: start each frame from the volume of the one before, and
             take only the steps that it needs.
         resume: Recordings and --tiles: keep the frames or tiles that an interrupted run left in VOLUME.zarr, if any,
@@ -52,9 +66,14 @@ class RecordingOptions(OptionGroup):
 
     watch: bool = False
     frame_interval: Annotated[float, Number(1e-9, 1e9, "s")] | None = None
-    track: Um | None = None
+    track: Annotated[tuple[float, ...], Parsed("xy[,z]", _search_range)] | None = None
+    track_memory: Annotated[int, click.IntRange(0, 10_000)] | None = None
     warm_start: bool | None = None
     resume: bool = False
+
+    def track_files(self, points: Path) -> list[Path]:
+        """The table of tracks and its picture beside a table of points, if particles are followed."""
+        return [side_file(points, f".tracks{suffix}") for suffix in (".csv", ".png") if self.track]
 
 
 @dataclass
@@ -259,25 +278,46 @@ class SeriesRun:
         return VolumeSeries(self.output, count, grid, **options, provenance=self.provenance)
 
     def _write_points(self, path: Path, series) -> str:
-        """Write the points of all frames; return their number, and that of particles, as text."""
-        from ..detection.particles import track
+        """Write the points of all frames, and their tracks; return their number, and that of particles, as text."""
+        from ..detection.particles import MEMORY, track
         from ..io.point_tables import write_points_in_time
         from ..io.provenance import INTENSITY
 
-        points, particles = [0], [0]
+        counts, followed = [0], []
 
         def count(frames) -> Iterator[tuple[int, dict[str, Any]]]:
             for number, columns in frames:
-                points.append(len(columns["x_mm"]))
-                particles[0] = max([*particles, *(1 + particle for particle in columns.get("particle", ()))])
+                counts.append(len(columns["x_mm"]))
+                if "particle" in columns:
+                    names = ("particle", "x_mm", "y_mm", "z_mm")
+                    followed.append(np.column_stack([np.full(counts[-1], number), *(columns[name] for name in names)]))
                 yield number, columns
 
         frames = ((number, self.frame.columns(note["points"])) for number, note in series.notes())
-        if self.options.track:
-            frames = track(frames, self.options.track / 1000)
-        write_points_in_time(path, count(frames), provenance=self.provenance | INTENSITY)
-        text = plural(sum(points), "point")
-        return f"{text} of {plural(particles[0], 'particle')}" if self.options.track else text
+        if ranges := self.options.track:
+            lateral, axial = ranges[0] / 1000, ranges[-1] / 1000
+            memory = self.options.track_memory
+            frames = track(frames, (lateral, axial), MEMORY if memory is None else memory)
+        provenance = self.provenance | INTENSITY
+        write_points_in_time(path, count(frames), provenance=provenance)
+        text = plural(sum(counts), "point")
+        if not ranges:
+            return text
+        particles = self._write_tracks(path, np.concatenate([np.zeros((0, 5)), *followed]), provenance)
+        return f"{text} of {plural(particles, 'particle')}"
+
+    def _write_tracks(self, points: Path, rows: np.ndarray, provenance: dict[str, str]) -> int:
+        """Write the tracks of points `(frame, particle, x, y, z)` as a table and a picture; return their number."""
+        from ..apps.trace_pictures import draw_tracks
+        from ..detection.particles import tracks_table
+        from ..io.point_tables import write_rows
+
+        (frame, particle), positions = rows[:, :2].T.astype(int), rows[:, 2:]
+        interval, (path, picture) = self.options.frame_interval, self.options.track_files(points)
+        table = tracks_table(frame, particle, positions, interval)
+        write_rows(path, table, zip(*table.values(), strict=True), provenance)
+        write_figure(picture, draw_tracks(frame, particle, positions, interval))
+        return len(table["particle"])
 
 
 def print_failed_tiles(series) -> int:

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Float, Float64, Int
 from skimage.measure import label, regionprops
 
 from ..base.errors import InputError, needs_extra
@@ -78,8 +78,11 @@ def find_clusters(
     return points[np.argsort(-points[:, 3], kind="stable")]
 
 
-# Frames that a particle may be missing from and still keep its number; trackpy's term.
+# Frames that a particle may be missing from and still keep its number, unless a caller says otherwise; trackpy's term.
 MEMORY = 2
+
+# Largest displacement between frames, mm: in all directions, or laterally and along z.
+SearchRange = float | tuple[float, float]
 
 
 def import_linker() -> Callable[..., Iterator[tuple[int, list[int]]]]:
@@ -90,7 +93,9 @@ def import_linker() -> Callable[..., Iterator[tuple[int, list[int]]]]:
     return trackpy.link_iter
 
 
-def link_particles(frames: Iterable[Float[np.ndarray, "_ 3"]], search_range: float) -> Iterator[list[int]]:
+def link_particles(
+    frames: Iterable[Float[np.ndarray, "_ 3"]], search_range: SearchRange, memory: int = MEMORY
+) -> Iterator[list[int]]:
     """Number the particle of each point, frame by frame; particles are counted from 0 in order of appearance.
 
     Parameters
@@ -98,8 +103,10 @@ def link_particles(frames: Iterable[Float[np.ndarray, "_ 3"]], search_range: flo
     frames
         Positions of the points of every frame in order, mm, also of frames without points. One frame is held at a time.
     search_range
-        Largest displacement between frames, mm, smaller than the distance of particles. Particles that were missing
-        from up to `MEMORY` frames are searched for within the same distance.
+        Largest displacement between frames, mm, smaller than the distance of particles. With two, displacements are
+        measured in units of them: of points that are less certain along z, an axial displacement counts less.
+    memory
+        Particles that were missing from up to so many frames are searched for within the same distance.
 
     Raises
     ------
@@ -110,20 +117,23 @@ def link_particles(frames: Iterable[Float[np.ndarray, "_ 3"]], search_range: flo
     from trackpy.linking import SubnetOversizeException
 
     frames = iter(frames)
+    lateral, axial = search_range if isinstance(search_range, tuple) else (search_range, search_range)
     try:
         # trackpy fails on an empty sequence.
         for first in itertools.islice(frames, 1):
-            for _, particles in link(itertools.chain([first], frames), search_range, memory=MEMORY):
+            for _, particles in link(itertools.chain([first], frames), (lateral, lateral, axial), memory=memory):
                 yield particles
     except SubnetOversizeException as error:
-        distance = f"{search_range * 1000:g} um"
+        distance = f"{lateral * 1000:g} um" + (f" ({axial * 1000:g} um along z)" if axial != lateral else "")
         raise InputError(f"--track: too many particles are within {distance} to tell them apart; reduce it.") from error
 
 
-def track(frames: Iterable[tuple[int, dict[str, list]]], search_range: float) -> Iterator[tuple[int, dict[str, list]]]:
+def track(
+    frames: Iterable[tuple[int, dict[str, list]]], search_range: SearchRange, memory: int = MEMORY
+) -> Iterator[tuple[int, dict[str, list]]]:
     """Insert the column `particle` after the first four columns of each frame's points.
 
-    Frames ascend; those left out have no points. `search_range` and errors as in `link_particles`.
+    Frames ascend; those left out have no points. `search_range`, `memory` and errors as in `link_particles`.
     """
     pending = deque()
 
@@ -137,9 +147,45 @@ def track(frames: Iterable[tuple[int, dict[str, list]]], search_range: float) ->
             yield np.array([columns[name] for name in ("x_mm", "y_mm", "z_mm")], float).T
             following = frame + 1
 
-    for particles in link_particles(positions(), search_range):
+    for particles in link_particles(positions(), search_range, memory):
         if (item := pending.popleft()) is not None:
             frame, columns = item
             names = list(columns)
             before, after = ({name: columns[name] for name in part} for part in (names[:4], names[4:]))
             yield frame, before | {"particle": particles} | after
+
+
+def tracks_table(
+    frames: Int[np.ndarray, " point"],
+    particles: Int[np.ndarray, " point"],
+    positions: Float[np.ndarray, "point 3"],
+    interval: float | None = None,
+) -> dict[str, np.ndarray]:
+    """Duration, path and mean speed of each particle; columns by name, in the order of the particles.
+
+    A path is the sum of the displacements between frames, in straight lines over frames from which the particle was
+    missing. Errors of the points lengthen it, mostly along z, so the lateral path is a column of its own.
+
+    Parameters
+    ----------
+    frames, particles, positions
+        Of each point; mm.
+    interval
+        Seconds between frames. None: durations are in frames, and speeds in mm a frame.
+    """
+    order = np.lexsort((frames, particles))
+    frames, particles, positions = frames[order], particles[order], positions[order]
+    numbers, first, owner, counts = np.unique(particles, return_index=True, return_inverse=True, return_counts=True)
+    last = first + counts - 1
+    steps = np.diff(positions, axis=0)[np.diff(particles) == 0]
+    # Of each step, the track that it belongs to.
+    of_track = owner[1:][np.diff(particles) == 0]
+    duration = (frames[last] - frames[first]) * (interval or 1.0)
+    table = {"particle": numbers, "points": counts, "first_frame": frames[first], "last_frame": frames[last]}
+    table["duration_s" if interval else "duration_frames"] = duration
+    for name, axes in (("", 3), ("lateral_", 2)):
+        path = np.bincount(of_track, np.linalg.norm(steps[:, :axes], axis=1), len(numbers))
+        table[f"{name}path_mm"] = path
+        speed = np.divide(path, duration, out=np.full(len(path), np.nan), where=duration > 0)
+        table[f"{name}speed_mm_{'s' if interval else 'frame'}"] = speed
+    return table | {"displacement_mm": np.linalg.norm(positions[last] - positions[first], axis=1)}
