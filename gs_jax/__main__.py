@@ -31,6 +31,7 @@ _MAX_MESSAGE = 380
 _MODULES = {
     "reconstruct": ("reconstruct", "deconvolve"),
     "captures": ("calibrate", "simulate"),
+    "traces": ("traces",),
     "designs": ("metrics", "layout", "optimize", "pareto", "info"),
     "new_design": ("new-design",),
     "fabrication": ("tolerance", "mold", "mask", "heights", "holder"),

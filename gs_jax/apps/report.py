@@ -52,6 +52,7 @@ from .pictures import (
     to_uint8,
     volume_html,
 )
+from .trace_pictures import draw_traces
 
 SLICE_BYTES = 6_000_000  # of all slices, before compression
 # Voxels in space, in all and along a side; points in space and in the table; pixels along a capture, and of its middle.
@@ -67,6 +68,7 @@ def write_report(
     grid: Grid | None = None,
     surface: SurfaceMaps | None = None,
     points: Points | None = None,
+    traces: Mapping[str, np.ndarray] | None = None,
     image: Image | None = None,
     tolerance: Mapping[str, Any] | None = None,
     notes: Mapping[str, str] | None = None,
@@ -90,6 +92,8 @@ def write_report(
         Sheets, as `read_surface` reads them.
     points
         `(x, y, z, intensity)`, mm.
+    traces
+        Columns of a table of `gs-jax traces`.
     image
         The capture.
     tolerance
@@ -129,7 +133,7 @@ def write_report(
         views["mold"], context["no_mold"] = _mold(design)
     with progress.step("Pictures"):
         context["capture"] = None if image is None else _capture(np.asarray(image))
-        context["volume"] = context["surface"] = context["points"] = None
+        context["volume"] = context["surface"] = context["points"] = context["traces"] = None
         if volume is not None and grid is not None:
             volume = np.asarray(volume)
             context["volume"] = {
@@ -147,6 +151,9 @@ def write_report(
             brightest = np.asarray(points, float)[np.argsort(-np.asarray(points)[:, 3], kind="stable")]
             context["points"] = {"count": len(points), "listed": brightest[:_LISTED_POINTS].tolist()}
             views["points"] = _point_view(brightest[:_MAX_POINTS, :3], grid) if len(points) else None
+        if traces is not None:
+            regions, frames = (len(np.unique(traces[name])) for name in ("region", "frame"))
+            context["traces"] = {"regions": regions, "frames": frames, "picture": figure_uri(draw_traces(traces))}
     context["views"] = {name: view for name, view in views.items() if view}
     write_text(path, page.render(context), [".html"])
 

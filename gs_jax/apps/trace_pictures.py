@@ -1,13 +1,20 @@
 """Pictures of traces and of tracks: regions and their signals over time, and the paths of particles."""
 
+from collections.abc import Mapping
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from matplotlib import colormaps
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+
+from ..microscope.grid import Grid
 
 # Colours of neighbours in number differ: steps of the golden ratio through a map.
 _COLOURS, _TURN = "turbo", (5**0.5 - 1) / 2
+# More regions are not numbered; rows of a heat map with labels.
+_NUMBERED, _TICKS = 100, 12
 
 
 def _colours(numbers: Int[np.ndarray, " item"]) -> np.ndarray:
@@ -36,4 +43,60 @@ def draw_tracks(
     above.set(xlabel="x, mm", ylabel="y, mm", title=f"{count}, from above", aspect="equal")
     above.invert_yaxis()
     depth.set(xlabel="time, s" if interval else "frame", ylabel="z, mm", title="Depth")
+    return figure
+
+
+def draw_traces(
+    columns: Mapping[str, Shaped[np.ndarray, " row"]],
+    image: Float[np.ndarray, "y x"] | None = None,
+    labels: Int[np.ndarray, "y x"] | None = None,
+    grid: Grid | None = None,
+) -> Figure:
+    """Draw regions from above, with their numbers, and a heat map of dF/F, a row for each.
+
+    Parameters
+    ----------
+    columns
+        Of a table of `traces_table`.
+    image, labels, grid
+        A picture of the volume, the regions in it, and their voxels, if there are any.
+    """
+    numbers, row = np.unique(columns["region"], return_inverse=True)
+    frames, column = np.unique(columns["frame"], return_inverse=True)
+    names = ("demixed", "intensity", "mean")
+    name = "dff" if np.isfinite(columns["dff"]).any() else next(name for name in names if name in columns)
+    values = np.full((len(numbers), len(frames)), np.nan)
+    values[row, column] = columns[name]
+    places = np.array([[np.median(columns[axis][row == n]) for axis in ("x_mm", "y_mm")] for n in range(len(numbers))])
+    figure = Figure(figsize=(12, 5), dpi=110, layout="constrained")
+    above, heat = figure.subplots(1, 2, width_ratios=(1, 1.4))
+    if image is not None and grid is not None:
+        low, high = np.percentile(image, (1, 99.8))
+        above.imshow(image, "gray", vmin=low, vmax=high, extent=grid.extent)
+        if labels is not None:
+            x, y = np.asarray(grid.x), np.asarray(grid.y)
+            for number, colour in zip(numbers, _colours(numbers), strict=True):
+                above.contour(x, y, labels == number, [0.5], colors=[colour], linewidths=1)
+    else:
+        above.scatter(*places.T, c=_colours(numbers), s=25)
+        above.set(aspect="equal")
+        above.invert_yaxis()
+    if len(numbers) <= _NUMBERED:
+        for number, place in zip(numbers, places, strict=True):
+            text = above.annotate(str(number), place, (4, 4), textcoords="offset points", fontsize=8, color="white")
+            text.set_path_effects([withStroke(linewidth=2, foreground="black")])
+    count = f"{len(numbers)} region{'s' * (len(numbers) != 1)}"
+    above.set(xlabel="x, mm", ylabel="y, mm", title=f"{count}, from above")
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
+    time = columns["time_s"] if "time_s" in columns else columns["frame"]
+    step = (time.max() - time.min()) / max(len(frames) - 1, 1) if len(time) else 0
+    ends = (time.min() - (step or 1) / 2, time.max() + (step or 1) / 2) if len(time) else (0, 1)
+    picture = heat.imshow(
+        values, "viridis", vmin=low, vmax=high, aspect="auto", extent=(*ends, len(numbers), 0), interpolation="nearest"
+    )
+    heat.set(xlabel="time, s" if "time_s" in columns else "frame", ylabel="region", title="Signals over time")
+    ticks = np.arange(0, len(numbers), -(-len(numbers) // _TICKS) or 1)
+    heat.set_yticks(ticks + 0.5, [str(numbers[tick]) for tick in ticks])
+    figure.colorbar(picture, ax=heat, label="dF/F" if name == "dff" else name)
     return figure

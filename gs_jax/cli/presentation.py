@@ -21,6 +21,7 @@ def report_command(
     output: Path,
     points: Path | None = None,
     surface: Path | None = None,
+    traces: Path | None = None,
     capture: Path | None = None,
     tolerance: Path | None = None,
     light: Light,
@@ -39,15 +40,17 @@ def report_command(
         output: REPORT.html.
         points: POINTS.csv: points for a table and a 3-D view.
         surface: SURFACE.ome.tif of `gs-jax reconstruct`: maps and a 3-D view.
+        traces: TRACES.csv or .h5 of `gs-jax traces`: its regions, and their signals over time.
         capture: CAPTURE.tif: the capture of VOLUME.
         tolerance: TOLERANCE.json of `gs-jax tolerance -o`.
     """
     from ..apps.report import read_tolerance, write_report
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
+    from ..io.traces import read_traces
     from ..io.volumes import read_surface, read_volume
 
-    inputs = (design, volume, points, surface, capture, tolerance)
+    inputs = (design, volume, points, surface, traces, capture, tolerance)
     if not capture and (given := given_options(CAPTURE_OPTIONS)):
         raise InputError(f"{given[0]} must be used with --capture.")
     with needs_extra("report"):
@@ -62,6 +65,8 @@ def report_command(
         results["surface"] = read_surface(surface)
     if points:
         results["points"] = read_scene_points(points)
+    if traces:
+        results["traces"] = read_traces(traces)
     if capture:
         camera.imager(microscope.imager())
         results["image"] = camera.read(capture)

@@ -433,6 +433,20 @@ def read_series(path: PathLike) -> Series | None:
         return Series(levels, scale["scale"], places, interval, (window["start"], window["end"]))
 
 
+def series_grid(series: Series) -> Grid:
+    """Positions of the voxels of a frame, with depths from the array."""
+    _, z, y, x = series.levels[0].shape
+    step, _, pitch = (value / 1000 for value in series.scale[1:])
+    depth, *first = (value / 1000 for value in series.first[1:])
+    origin = [round(at + (n - 1) / 2 * pitch, 9) for at, n in zip(first, (y, x), strict=True)]
+    return Grid([round(depth + index * step, 9) for index in range(z)], (y, x), pitch, origin[::-1])
+
+
+def finished_frames(path: PathLike) -> list[int]:
+    """Frames of what `VolumeSeries` wrote that have a volume, in their order; the others read as zeros."""
+    return sorted(_finished(Path(path)))
+
+
 def check_replaceable(path: Path, otherwise: str = "--force to replace it") -> None:
     """Raise `InputError` if the path has an unfinished recording, which `VolumeSeries` would replace."""
     if (head := _read_head(path)) is None:

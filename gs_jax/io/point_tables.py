@@ -50,19 +50,21 @@ def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
     >>> gs.read_points("points.csv")
     array([[ 0.5, -0.4, 19.5,  1. ]])
     """
-    return _read_points(path)[0]
+    return read_point_columns(path)[0]
 
 
 def read_scene_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
     """Points of one scene, as `read_points`; `InputError` if a column `frame` has those of several."""
-    points, more = _read_points(path)
+    points, more = read_point_columns(path)
     if (count := len(np.unique(more.get("frame", [])))) > 1:
         raise input_error("column frame", "of one frame, which is one scene", f"{count} frames", path)
     return points
 
 
-def _read_points(path: PathLike) -> tuple[Float64[np.ndarray, "point 4"], dict[str, Float64[np.ndarray, " point"]]]:
-    """Points with depths from the array, and further columns by name."""
+def read_point_columns(
+    path: PathLike,
+) -> tuple[Float64[np.ndarray, "point 4"], dict[str, Float64[np.ndarray, " point"]]]:
+    """Points with depths from the array, and further columns by name; `InputError` as `read_points`."""
     names, table = read_table(path, POINTS_HEADER, MAX_POINTS)
     points, more = np.ascontiguousarray(table[:, :4]), dict(zip(names[4:], table[:, 4:].T, strict=True))
     points[:, 2] += more.get(SURFACE, 0.0)

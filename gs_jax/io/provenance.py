@@ -21,7 +21,7 @@ import tifffile
 from PIL import Image
 
 from .._version import __version__
-from ..base.errors import input_error
+from ..base.errors import input_error, needs_extra
 from ..base.typing import PathLike
 from ..microscope.grid import Grid
 from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, side_file, write_json
@@ -136,6 +136,13 @@ def _from_3mf(path: Path) -> dict:
     return {}
 
 
+def _from_hdf5(path: Path) -> dict:
+    with needs_extra("hdf5"):
+        import h5py
+    with h5py.File(path) as file:
+        return json.loads(str(file.attrs.get(KEY, "{}")))
+
+
 _READERS: dict[str, Callable[[Path], dict]] = {
     **dict.fromkeys(TIFF_SUFFIXES, _from_tiff),
     ".png": _from_png,
@@ -144,6 +151,7 @@ _READERS: dict[str, Callable[[Path], dict]] = {
     ".npz": _from_weights,
     ".3mf": _from_3mf,
     ".json": _from_json,
+    ".h5": _from_hdf5,
     **dict.fromkeys((".npy", ".csv", ".stl", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"), _from_sidecar),
 }
 

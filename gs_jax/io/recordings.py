@@ -163,7 +163,7 @@ def _zarr_source(path: Path, allowed: str) -> Source:
     zarr = import_zarr()
     with decoding(remote_url(path) or path, "Zarr store"):
         store = _only_series(open_store(path))
-        array = store if isinstance(store, zarr.Array) else _image_array(store)
+        array = store if isinstance(store, zarr.Array) else zarr_image(store)
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: no image; must be a Zarr array (t, y, x), or OME-Zarr of one image.")
     shape, names = array.shape, _axes(store, array)
@@ -196,7 +196,7 @@ def _only_series(store):
     return store
 
 
-def _image_array(group) -> Any:
+def zarr_image(group) -> Any:
     """The full-size array of OME-Zarr of one image, or the only array of a group."""
     images = ngff_attributes(group).get("multiscales") or [{}]
     if len(images) == 1 and (datasets := images[0].get("datasets")):

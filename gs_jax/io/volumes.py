@@ -401,6 +401,15 @@ def _parse_multiscales(path: Path, attributes: dict[str, Any]) -> tuple[str, lis
         raise input_error("`multiscales`", allowed, f"{error!r:.80}", path) from error
 
 
+def write_labels(
+    path: PathLike, labels: Int[np.ndarray, "depth row column"], grid: Grid, provenance: Provenance | None = None
+) -> None:
+    """Write a label image as OME-TIFF of 16 bits, or of 32 if there are many; `InputError` as `check_output`."""
+    path = check_output(path, TIFF_SUFFIXES)
+    voxels = labels.astype(np.uint16 if labels.max() < 2**16 else np.uint32)
+    _write_ome(path, voxels, "ZYX", provenance, depths=plain_depths(grid), pitch=grid.pitch, first=first_um(grid))
+
+
 class SurfaceMaps(NamedTuple):
     """Sheets of a file: brightness, depth from the array and its standard deviation, mm, and where the columns are."""
 
