@@ -24,9 +24,10 @@ from gs_jax.reconstruction.demixing import demix, image_regions, prepare_demixin
 from gs_jax.reconstruction.traces import RegionSignals, SummaryVolumes, regions_of_points, traces_table
 from gs_jax.simulation import random_points
 
-# A quarter of the lenses, the pixels that they need, and the box of the beads, mm.
-LENSES, PIXELS, SIZE, DEPTHS = 50, 2300, (5.0, 5.0), (18.5, 21.5)
-BEADS, FRAMES, RAYS = 40, 24, 4000
+# A quarter of the lenses, the pixels that they need, and the sides of the boxes of the beads, mm.
+LENSES, PIXELS, SIZES, DEPTHS = 50, 2300, (5.0, 1.2), (18.5, 21.5)
+# Beads, the dimmest of which is at least this part as bright as the brightest, frames, and rays from a bead to a lens.
+BEADS, LEAST, FRAMES, RAYS = 40, 0.1, 24, 4000
 # Voxels, mm, and half axes of the regions about the beads, mm.
 VOXEL, STEP, RADIUS = 0.04, 0.5, (0.06, 0.5)
 # Electrons of the brightest pixel, a count, the counts of a dark pixel, and of read noise. Exposures of the weights.
@@ -52,10 +53,10 @@ def middle_of(design: gs.Design, lenses: int, pixels: int) -> gs.Imager:
     return design.replace(centers_mm=centers, size_mm=(side, side), shape=(pixels, pixels)).imager()
 
 
-def scene(imager: gs.Imager, count: int, frames: int, rays: int, progress: gs.Progress) -> Scene:
+def scene(imager: gs.Imager, size: float, count: int, frames: int, rays: int, progress: gs.Progress) -> Scene:
     """Beads that are lit in four of ten frames, as bright as chance wants."""
-    rng, beads = np.random.default_rng(1), random_points(count, SIZE, DEPTHS, seed=1)
-    light = rng.lognormal(0, 0.3, (frames, count)) * (rng.random((frames, count)) < 0.4) * rng.uniform(0.4, 1, count)
+    rng, beads = np.random.default_rng(1), random_points(count, (size, size), DEPTHS, seed=1)
+    light = rng.lognormal(0, 0.3, (frames, count)) * (rng.random((frames, count)) < 0.4) * rng.uniform(LEAST, 1, count)
     tracing = progress.track(beads, "Tracing beads")
     images = vstack([csr_array(traced(bead[None], imager, rays).reshape(1, -1)) for bead in tracing]).tocsr()
     clean = np.stack([images.T @ row for row in light])
@@ -66,18 +67,32 @@ def scene(imager: gs.Imager, count: int, frames: int, rays: int, progress: gs.Pr
 
 
 def run(
-    design: gs.Design, *, lenses=LENSES, pixels=PIXELS, beads=BEADS, frames=FRAMES, rays=RAYS, progress: gs.Progress
+    design: gs.Design,
+    size: float,
+    *,
+    lenses=LENSES,
+    pixels=PIXELS,
+    beads=BEADS,
+    frames=FRAMES,
+    rays=RAYS,
+    progress: gs.Progress,
 ) -> tuple[dict[str, Any], Figure]:
     """Return the correlations of each bead that is found, and a picture of its regions and signals."""
-    made = scene(middle_of(design, lenses, pixels), beads, frames, rays, progress)
+    return measured(scene(middle_of(design, lenses, pixels), size, beads, frames, rays, progress), size, progress)
+
+
+def measured(made: Scene, size: float, progress: gs.Progress) -> tuple[dict[str, Any], Figure]:
+    """`run`, of a scene."""
+    frames = len(made.captures)
     depths = np.arange(DEPTHS[0], DEPTHS[1] + STEP / 2, STEP)
-    grid = gs.Grid(depths, (round(SIZE[1] / VOXEL) + 21, round(SIZE[0] / VOXEL) + 21), VOXEL)
+    grid = gs.Grid(depths, 2 * (round(size / VOXEL) + 21,), VOXEL)
     mean = made.captures.mean(0, dtype=np.float32)
     points = gs.find_points(mean, made.imager, grid, progress=progress)
     away, bead = KDTree(made.beads[:, :3] / (NEAR[0], NEAR[0], NEAR[1])).query(
         points[:, :3] / (NEAR[0], NEAR[0], NEAR[1])
     )
-    points, bead, false = points[away < 1], bead[away < 1], int(np.sum(away >= 1))
+    near = np.asarray(away) < 1
+    points, bead, false = points[near], np.asarray(bead)[near], int(np.sum(~near))
     truth = made.light[:, bead]
     images = image_regions([np.array([[*point[:3], 1.0]]) for point in points], made.imager, progress=progress)
     system = prepare_demixing(images, made.captures[:: -(-frames // REFERENCES)])
@@ -93,7 +108,8 @@ def run(
     # Of what is left beside the scale of each trace.
     gain = (light * truth).sum(0) / (truth**2).sum(0)
     share = (light - gain * truth)[truth > 0] / error[truth > 0]
-    numbers = {"lenses": lenses, "pixels": pixels, "beads": beads, "frames": frames, "false_points": false}
+    numbers = {"lenses": len(made.imager.array.centers), "pixels": made.captures.shape[-1], "frames": frames}
+    numbers |= {"beads": len(made.beads), "false_points": false}
     numbers |= {"found": len(np.unique(bead)), "used_pixels": len(images.pixels)} | found
     numbers |= {"of_standard_error": float(share.std()), "gain_spread": float(gain.std() / gain.mean())}
     dark = np.full(light.shape, np.nan)
@@ -108,16 +124,23 @@ def _correlations(found: np.ndarray, truth: np.ndarray) -> list[float]:
 
 def report(design: Path | None, progress: gs.Progress) -> Report:
     """Run at full size, and tabulate."""
-    numbers, figure = run(gs.read_design(design) if design else gs.geomscope(), progress=progress)
+    rows, numbers, figure = [], {}, None
+    for size in SIZES:
+        numbers[size], figure = run(gs.read_design(design) if design else gs.geomscope(), size, progress=progress)
+        rows += rows_of(size, numbers[size])
+    columns = ["box, mm", "found", "false", "traces", "least correlation", "median", "errors / standard errors"]
+    return tables_report("traces", numbers, (columns, rows), title="Traces", **({"png": figure} if figure else {}))
+
+
+def rows_of(size: float, numbers: dict[str, Any]) -> list[list[str]]:
+    """Rows of the table of one box."""
     rows = []
-    for name, title in (("demixed", "demixed from the captures"), ("voxels", "means of voxels (back-projection)")):
+    for name, title in (("demixed", "demixed"), ("voxels", "means of voxels")):
         values = np.array(numbers[name])
-        parts = (np.min(values), np.median(values), np.mean(values >= 0.98))
-        rows.append([title, *(f"{part:.3f}" for part in parts[:2]), f"{parts[2]:.0%}"])
-    columns = ["traces", "least correlation", "median", "0.98 or more"]
-    text = f"{numbers['found']} of {numbers['beads']} beads were found, and {numbers['false_points']} false points. "
-    text += f"Beside the scale of each trace, errors are {numbers['of_standard_error']:.2g} standard errors."
-    return tables_report("traces", numbers, (columns, rows), title="Traces", text=text, png=figure)
+        parts = [f"{size:g}", f"{numbers['found']}", f"{numbers['false_points']}", title]
+        share = f"{numbers['of_standard_error']:.2f}" if name == "demixed" else ""
+        rows.append([*parts, f"{values.min():.4f}", f"{np.median(values):.4f}", share])
+    return rows
 
 
 if __name__ == "__main__":

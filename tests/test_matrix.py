@@ -37,6 +37,7 @@ from gs_jax.mold.heights import write_heights
 from gs_jax.mold.holder import HolderShape, make_rig
 from gs_jax.mold.manufacturability import check_solid
 from gs_jax.optics.raytrace import to_numpy
+from gs_jax.reconstruction.demixing import demix, image_regions, prepare_demixing
 from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 from gs_jax.reconstruction.plan import Plan, follow_volume
 from gs_jax.reconstruction.radius_fit import fit_radius
@@ -295,6 +296,15 @@ def tiled(case: Case, folder: Path) -> None:
         assert tiles.count > 1 and second > first - 0.1 and first > empty, (name, first, second)
 
 
+def demixed(case: Case, _) -> None:
+    """The light of points at their true places, from their capture by the independent tracer, but for one scale."""
+    images = image_regions([np.append(point[:3], 1.0)[None] for point in case.points], case.imager)
+    found = demix(case.of_points, prepare_demixing(images, [case.of_points]))
+    scale = found.light / case.points[:, 3]
+    np.testing.assert_allclose(scale, np.median(scale), rtol=0.1)
+    assert (found.error < 0.1 * found.light).all()
+
+
 def calibrate(case: Case, _) -> None:
     places = case.points[[0, 2], :3]
     images = [case.capture(np.append(place, 1.0)[None]) for place in places]
@@ -437,6 +447,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     "radius": refocused,
     "follow": followed,
     "tiles": tiled,
+    "demix": demixed,
     "calibrate": calibrate,
     "pattern": pattern,
     "metrics": metrics,
@@ -499,7 +510,7 @@ ONCE = {
 
 # A score and a radius are reconstructions of pixels that are masked the same way for every lens, and frames that follow
 # are starts of solvers that all devices have: so on the richest devices.
-ON_THE_RICHEST = ("score", "radius", "follow", "tiles")
+ON_THE_RICHEST = ("score", "radius", "follow", "tiles", "demix")
 RICHEST = ("geomscope", "curved, tilted, two radii, layers", "one lens")
 # Devices that differ from others in their files alone, or in size.
 FEW = ("samples", "small lenses")

@@ -8,6 +8,7 @@ import tifffile
 import zarr
 
 import gs_jax as gs
+from experiments import traces as experiment
 from gs_jax.base.errors import InputError
 from gs_jax.io.ngff import VolumeSeries, read_series, series_grid
 from gs_jax.io.traces import read_labels, read_traces, write_traces
@@ -303,3 +304,12 @@ def test_what_a_person_made_stays(recording, run):
     (recording.parent / "u.csv.labels.tif").write_text("mine")
     status, _, err = run("traces", recording, "-o", "u.csv")
     assert status == 2 and "--force replaces it" in err and not (recording.parent / "u.csv").exists()
+
+
+@pytest.mark.integration
+def test_beads_of_an_independent_ray_tracer():
+    """Places are those that are found; a region's image is the model's."""
+    small = {"lenses": 30, "pixels": 1600, "beads": 8, "frames": 8, "rays": 2000}
+    numbers, _ = experiment.run(gs.geomscope(), 1.2, **small, progress=gs.Progress())
+    assert (numbers["found"], numbers["false_points"]) == (8, 0)
+    assert min(numbers["demixed"]) >= 0.98 and numbers["of_standard_error"] < 2

@@ -150,10 +150,12 @@ def traces_command(
         provenance = camera.recorded(provenance_of(*inputs)) | {"baseline": f"percentile {used}"}
         with progress.step("Writing"):
             write_traces(output, table, provenance)
-            flat = None if found.labels is None else found.labels.max(0)
-            write_figure(picture, draw_traces(table, found.image, flat, found.grid))
-            if own_labels:
-                write_labels(beside, found.labels, found.grid, provenance)
+            labels = found.labels
+            write_figure(
+                picture, draw_traces(table, found.image, None if labels is None else labels.max(0), found.grid)
+            )
+            if own_labels and labels is not None:
+                write_labels(beside, labels, found.grid, provenance)
     camera.print_corrections()
     text = f"{plural(len(found.numbers), 'region')} in {plural(len(found.frames), 'frame')}"
     for line in (*found.lines, f"{text}, dF/F over the percentile {used}"):

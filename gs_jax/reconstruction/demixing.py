@@ -119,11 +119,12 @@ def prepare_demixing(regions: RegionImages, captures: Iterable[Image]) -> Demixi
     Raises `InputError` if two regions cast the same image.
     """
     columns = np.concatenate([regions.images, _modes(regions)])
-    mean = np.mean([capture.ravel()[regions.pixels] for capture in captures], axis=0, dtype=np.float64)
+    parts = [np.asarray(capture, np.float32).ravel()[regions.pixels] for capture in captures]
+    mean = np.asarray(np.mean(parts, axis=0, dtype=np.float64))
     count = len(regions.images)
     _check_distinct(regions.images)
     equal = _normal_equations(regions.pixels, columns, np.ones(len(mean), np.float32), count)
-    explained, background = _explain(equal, mean.astype(np.float32))
+    explained, background = _explain(equal, np.asarray(mean, np.float32))
     left, light = mean - explained - background, np.maximum(explained, 0)
     (constant, share), _ = nnls(np.column_stack([np.ones(len(left)), light]), left**2)
     variance = constant + share * light
@@ -186,7 +187,7 @@ def demix(capture: Image, system: Demixing) -> Demixed:
     lacks. An error of a region's place or image that is the same in all captures changes the scale of its trace, which
     the standard error does not tell.
     """
-    values = capture.ravel()[system.pixels].astype(np.float32)
+    values = np.asarray(capture, np.float32).ravel()[system.pixels]
     solution = _solve(system, values)
     left = values - solution @ system.columns
     variance = system.squares @ left**2 * (len(values) / max(len(values) - len(solution), 1))

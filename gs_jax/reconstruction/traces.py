@@ -117,7 +117,7 @@ class RegionSignals:
         self._inside = np.flatnonzero(labels)
         self._owner = np.searchsorted(self.numbers, labels.ravel()[self._inside])
         self.sizes = np.bincount(self._owner)
-        free = ~binary_dilation(labels > 0, np.ones((1, 3, 3), bool), _GAP)
+        free = ~np.asarray(binary_dilation(labels > 0, np.ones((1, 3, 3), bool), _GAP), bool)
         if not free.any():
             raise InputError("regions must leave voxels for the background, got regions that fill the volume.")
         boxes = find_objects(labels)
