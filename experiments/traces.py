@@ -128,7 +128,7 @@ def report(design: Path | None, progress: gs.Progress) -> Report:
     for size in SIZES:
         numbers[size], figure = run(gs.read_design(design) if design else gs.geomscope(), size, progress=progress)
         rows += rows_of(size, numbers[size])
-    columns = ["box, mm", "found", "false", "traces", "least correlation", "median", "errors / standard errors"]
+    columns = ["box, mm", "found", "false", "traces", "least correlation", "median", "0.98 or more", "errors / standard errors"]
     return tables_report("traces", numbers, (columns, rows), title="Traces", **({"png": figure} if figure else {}))
 
 
@@ -139,7 +139,7 @@ def rows_of(size: float, numbers: dict[str, Any]) -> list[list[str]]:
         values = np.array(numbers[name])
         parts = [f"{size:g}", f"{numbers['found']}", f"{numbers['false_points']}", title]
         share = f"{numbers['of_standard_error']:.2f}" if name == "demixed" else ""
-        rows.append([*parts, f"{values.min():.4f}", f"{np.median(values):.4f}", share])
+        rows.append([*parts, f"{values.min():.4f}", f"{np.median(values):.4f}", f"{np.sum(values >= 0.98)}", share])
     return rows
 
 
