@@ -128,7 +128,16 @@ def report(design: Path | None, progress: gs.Progress) -> Report:
     for size in SIZES:
         numbers[size], figure = run(gs.read_design(design) if design else gs.geomscope(), size, progress=progress)
         rows += rows_of(size, numbers[size])
-    columns = ["box, mm", "found", "false", "traces", "least correlation", "median", "0.98 or more", "errors / standard errors"]
+    columns = [
+        "box, mm",
+        "found",
+        "false",
+        "traces",
+        "least correlation",
+        "median",
+        "0.98 or more",
+        "errors / standard errors",
+    ]
     return tables_report("traces", numbers, (columns, rows), title="Traces", **({"png": figure} if figure else {}))
 
 
