@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
-from jaxtyping import Array, Float32, Shaped
+from jaxtyping import Array, Float32, Int, Shaped
 
 from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
