@@ -119,12 +119,13 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
                     for key in ("s", "db")
                 ]
                 axes.plot(*means, "o-", label=name)
-            axes.set(title=f"{kind}, {exposure} e", xscale="log")
+            axes.set_title(f"{kind}, {exposure} e")
     for axes in grid[-1]:
         axes.set_xlabel("processor time, s")
     for axes in grid[:, 0]:
         axes.set_ylabel("dB above empty")
-    grid[0, 0].legend(fontsize=7)
+    grid[0, 0].set_xlim(0, 1.1 * max(row["s"] for row in rows))
+    grid[0, -1].legend(fontsize=7, loc="upper left")
     return figure
 
 

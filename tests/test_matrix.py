@@ -468,7 +468,7 @@ REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
     ("one lens", "pattern"): "a pattern needs an array of 6 lenses or more, got 1",
     ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",
-    ("small lenses", "holder"): "must begin beyond the holder",
+    **{(name, "holder"): "must begin beyond the holder" for name in ("small lenses", "endoscope")},
     **{(name, "holder"): "must begin with 1 mm of air" for name in ("layers", "samples", "tilted, layers")},
     ("out of focus", "calibrate"): "of 20 bright spots on lenses",
 }
