@@ -25,6 +25,7 @@ from gs_jax import (
     write_design,
 )
 from gs_jax.projection.rays import trace
+from gs_jax.reconstruction.residual import BRIGHT
 from gs_jax.simulation import random_points
 
 from .compilations import compilations as compilations
@@ -173,3 +174,10 @@ def design_and_capture(folder: Path) -> np.ndarray:
     image = simulate(points, design.imager(), optics="near", psf="geometric")
     write_capture(folder / "capture.tif", np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=2e4)))
     return points
+
+
+def shares_within(volume: np.ndarray, deviation: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Shares of the bright voxels that differ from the truth, scaled best, by one deviation at most, and by two."""
+    bright = volume > BRIGHT * volume.max()
+    error = np.abs(volume - np.vdot(volume, truth) / np.vdot(truth, truth) * truth)[bright]
+    return float(np.mean(error <= deviation[bright])), float(np.mean(error <= 2 * deviation[bright]))

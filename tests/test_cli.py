@@ -11,6 +11,8 @@ import gs_jax as gs
 from gs_jax.__main__ import main
 from gs_jax.cli.options import parse_depths
 from gs_jax.io.provenance import SCORE, read_provenance
+from gs_jax.io.volumes import read_deviation
+from gs_jax.widget.layers import reader
 
 from .helpers import DESIGN, needs
 
@@ -80,10 +82,25 @@ def test_a_score_is_told_and_kept(folder, run):
     """In the file's provenance, from which a report reads it."""
     image = np.random.default_rng(0).integers(7, 90, (96, 80)).astype(np.uint16)
     tifffile.imwrite(folder / "capture.tif", image)
-    options = "20 --voxel-um 50 --score -o v.tif -q".split()
+    options = "20 --voxel-um 50 --score --deviation sd.tif -o v.tif -q".split()
     status, out, _ = run(*RECONSTRUCT[:4], *options)
     assert status == 0 and "v.tif: it predicts lenses that were left out" in out
     assert read_provenance(folder / "v.tif")[SCORE] in out
+    # In a file of its own, which a report takes, and napari shows as a layer.
+    assert "sd.tif: standard deviations are " in out
+    (volume, grid), deviation = gs.read_volume(folder / "v.tif"), gs.read_volume(folder / "sd.tif")[0]
+    np.testing.assert_array_equal(read_deviation(folder / "sd.tif", grid), deviation)
+    assert deviation.shape == volume.shape and (deviation > 0).any()
+    read = reader(path := str(folder / "sd.tif"))
+    assert read is not None
+    ((shown, options, _),) = read(path)
+    np.testing.assert_array_equal(shown, deviation)
+    assert options["colormap"] == "viridis" and options["name"] == "sd.tif"
+    status, _, err = run("report", "design.toml", "v.tif", "--deviation", "v.tif", "-o", "r.html")
+    assert (
+        status == 2
+        and "must be the standard deviations of gs-jax reconstruct --deviation, got another volume (v.tif)" in err
+    )
 
 
 def test_one_depth_and_the_default_voxel(folder, run):
@@ -233,6 +250,11 @@ WRONG_ARGUMENTS = [
         for option in ("--seed", "--peak-electrons", "--gain", "--offset", "--read-noise", "--full-well", "--bits")
     ),
     (f"{FULL} --score --suppress clusters", "--score must be used with --suppress none"),
+    (f"{FULL} --deviation d.tif --method surface", "--deviation must be used with .* methods of free voxels"),
+    (f"{FULL} --deviation v.tif", "v.tif: outputs must be different files"),
+    (f"{FULL} --deviation d.csv", "d.csv"),
+    (f"{BASE} --depths 20 --tiles auto --deviation d.tif -o v.zarr", "--deviation must not be given with --tiles"),
+    ("report design.toml --deviation d.tif -o r.html", "--deviation must be used with VOLUME"),
     ("heights design.toml --step-um 10 -o l.csv", "--step-um must be used with heights"),
     ("mold design.toml --positive --draft-deg 1 -o m.stl", "--draft-deg must be used without"),
     ("report design.toml --dark d.tif -o r.html", "--dark must be used with --capture"),

@@ -291,6 +291,7 @@ def test_wrong_input_is_one_line(folder, run, monkeypatch):
         (*WATCH, "--workers", "2"): "--workers and --scheduler must not be given with --watch",
         (*WATCH, "--method", "surface", "--surface", "s.ply"): "--surface must be used with a single capture",
         (*WATCH, "--score"): "--score must be used with a single capture",
+        (*WATCH, "--deviation", "d.tif"): "--deviation must be used with a single capture",
         (WATCH[0], "capture.tif", *WATCH[2:]): "capture.tif must be a folder to be watched, got a file",
         (WATCH[0], "none", *WATCH[2:]): "none must be a folder to be watched, got none",
     }.items():

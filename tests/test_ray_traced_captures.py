@@ -6,10 +6,12 @@ import pytest
 
 from experiments.common import local_maxima, points_of
 from experiments.through_layers import on_points, scope_of
-from gs_jax import Grid, localization, read_capture, read_design, reconstruct
+from experiments.true_image import words
+from gs_jax import Grid, cross_validated, localization, rasterize, read_capture, read_design, reconstruct
 from gs_jax.base.progress import Progress
+from gs_jax.reconstruction.pipeline import METHODS, PIXELS_PER_VOXEL, voxel_grid
 
-from .helpers import needs
+from .helpers import needs, shares_within
 
 pytestmark = pytest.mark.integration
 
@@ -27,6 +29,18 @@ def test_plain_back_projection_shows_ray_traced_points():
     # The paper's resolution, laterally and axially.
     every, brightest = (localization(some, truth, lateral=0.04, axial=0.3) for some in (peaks, peaks[: len(truth)]))
     assert every.recall >= 0.95 and brightest.precision >= 0.9 and every.lateral_rmse <= 0.02
+
+
+def test_deviations_hold_for_ray_traced_letters():
+    """Two thirds of the bright voxels are right within one, and 95 % within two, but for a tenth."""
+    needs("geomscope/centers.csv")
+    data = needs("oracle/dev/P1_h.tif").parent
+    scope = read_design(data / "P1.toml").imager()
+    grid = voxel_grid(scope, list(np.arange(18.0, 22.01, 0.5)), pixels=4 * PIXELS_PER_VOXEL)
+    seen = read_capture(data / "P1_h.tif", scope.sensor.shape), scope, grid, METHODS["list-rl"](20)
+    truth = np.asarray(rasterize(words(data / "h.json"), grid))
+    one, two = shares_within(reconstruct(*seen), cross_validated(*seen).deviation, truth)
+    assert abs(one - 0.68) < 0.1 and abs(two - 0.95) < 0.1
 
 
 def test_points_in_a_gel_are_where_they_are():

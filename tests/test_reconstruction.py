@@ -22,7 +22,7 @@ from gs_jax.optics.psf import psf_of_depth
 from gs_jax.reconstruction.inverse_problem import discrepancy_target, noise_variance, prepare_data, prepare_model
 from gs_jax.reconstruction.pipeline import METHODS, voxel_grid
 from gs_jax.reconstruction.radius_fit import _bounds, _middle, fit_radius, with_radii
-from gs_jax.reconstruction.residual import folds_of_lenses, kept_pixels_of_folds
+from gs_jax.reconstruction.residual import FLOOR, GAIN, folds_of_lenses, jackknife_deviation, kept_pixels_of_folds
 from gs_jax.simulation import simulate_volume
 from gs_jax.solvers.richardson_lucy import background_step, kl_divergence
 
@@ -499,3 +499,13 @@ def test_the_middle_keeps_its_place(radius, pitch, binning, margin):
     # Within a pixel of the middle.
     half = 0.01 * (binning - 1)
     np.testing.assert_allclose(found, one.sensor.to_mm(np.array([107, 101])), atol=half + 1e-6)
+
+
+def test_the_jackknife_is_the_deviation_of_a_mean():
+    """Of volumes that are means of all folds but one, whose noise is independent; dark but for the noise."""
+    folds = np.random.default_rng(0).normal(0, [[[[0.1]], [[0.3]]]], (4, 2, 120, 120))
+    volumes = [np.delete(folds, fold, 0).mean(0).astype(np.float32) for fold in range(4)]
+    deviation = np.sqrt(np.mean(jackknife_deviation(volumes) ** 2, (1, 2)))
+    # What folds have in common is noise here, which is averaged over neighbours.
+    np.testing.assert_allclose(deviation / GAIN, [0.1 / 2, 0.3 / 2], rtol=0.05)
+    np.testing.assert_allclose(jackknife_deviation([np.full((2, 9, 9), 3, np.float32)] * 4), 3 * FLOOR, rtol=1e-6)

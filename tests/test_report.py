@@ -24,6 +24,7 @@ from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
+from gs_jax.io.provenance import DEVIATION
 from gs_jax.io.volumes import write_surface, write_volume
 from gs_jax.microscope.layouts import plate_corners
 from gs_jax.optics.raytrace import trace_lenslet
@@ -66,13 +67,14 @@ def made(tmp_path_factory):
     volume = rng.uniform(0, 1, GRID.volume_shape).astype(np.float32)
     volume[3, 10:14, 10:14] = 9
     write_volume(folder / "volume.ome.tif", volume, GRID, {"command": f"gs-jax reconstruct {folder}/capture.tif"})
+    write_volume(folder / "sd.ome.tif", 0.1 * volume, GRID, {DEVIATION: "of the voxels of volume.ome.tif"})
     write_points(folder / "points.csv", np.column_stack([rng.uniform(-0.5, 0.5, (7, 2)), rng.uniform(18, 21, (7, 2))]))
     tifffile.imwrite(folder / "capture.tif", rng.integers(0, 900, (96, 80), np.uint16))
     (folder / "tolerance.json").write_text(json.dumps(TOLERANCE))
     words = [folder / "design.toml", folder / "volume.ome.tif", "--points", folder / "points.csv"]
     maps = np.where(volume[:1] > 0.1, [[[1.0]], [[19.0]], [[0.1]]], np.nan).astype(np.float32)[:, None]
     write_surface(folder / "sheet.ome.tif", np.nan_to_num(maps[0]), maps[1], maps[2], GRID)
-    words += ["--surface", folder / "sheet.ome.tif"]
+    words += ["--surface", folder / "sheet.ome.tif", "--deviation", folder / "sd.ome.tif"]
     words += ["--capture", folder / "capture.tif", "--tolerance", folder / "tolerance.json", "--bad-pixels", "none"]
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stop:
         patch.setattr(sys, "argv", ["gs-jax", "report", *map(str, words), "-q", "-o", str(folder / "report.html")])
@@ -92,6 +94,7 @@ def test_the_page_has_all_parts_and_no_path(made):
     assert "input volume.ome.tif" in text and "gs-jax reconstruct capture.tif" in text and "first.toml" in text
     assert "small &lt;/script&gt;&lt;b&gt;&amp;" in text and "<b>" not in text
     assert "10.1002/lpor.202100072" in text and "5.8123" in text and "50 % of 8 devices" in text
+    assert "standard deviations are 10% of the brightness" in text
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "@import" not in text
 
 

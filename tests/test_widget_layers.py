@@ -7,6 +7,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
+from gs_jax.base.errors import InputError
 from gs_jax.base.progress import CancellableProgress, Cancelled
 from gs_jax.io.volumes import read_volume
 from gs_jax.widget.layers import Newest, newest_captures, prepare_layers
@@ -39,6 +40,18 @@ def test_a_capture_becomes_what_the_command_writes(folder, run):
     assert run(*words)[0] == 0
     # Float32 sums in another order.
     np.testing.assert_allclose(volume, read_volume(folder / "v.tif")[0], rtol=1e-5)
+
+
+@pytest.mark.integration
+def test_deviations_are_a_layer(folder):
+    progress = CancellableProgress(lambda: False)
+    image = np.random.default_rng(0).integers(7, 90, (96, 80)).astype(np.uint16)
+    make = prepare_layers(folder / "design.toml", "20", 50.0, "backproject", "none", False, progress, deviation=True)
+    (deviation, described, _), (volume, _, _) = make("seen", image).layers
+    assert described["name"] == "seen, standard deviation" and described["colormap"] == "viridis"
+    assert deviation.shape == volume.shape and (deviation[volume > 0] > 0).all()
+    with pytest.raises(InputError, match="Deviation must be used with --suppress none"):
+        prepare_layers(folder / "design.toml", "20", 50.0, "backproject", "points", False, progress, deviation=True)
 
 
 def test_the_newest_capture_of_a_folder_is_made_until_the_user_cancels(tmp_path, folder):

@@ -28,6 +28,7 @@ from ..microscope.grid import Grid
 from ..mold.lenslets import Part
 from ..mold.solids import MoldShape, preview_solid
 from ..optics.raytrace import to_numpy
+from ..reconstruction.residual import format_deviation
 from .drawings import (
     Psfs,
     count_lenses,
@@ -66,6 +67,7 @@ def write_report(
     *,
     volume: Num[Array | np.ndarray, "z y x"] | None = None,
     grid: Grid | None = None,
+    deviation: Num[Array | np.ndarray, "z y x"] | None = None,
     surface: SurfaceMaps | None = None,
     points: Points | None = None,
     traces: Mapping[str, np.ndarray] | None = None,
@@ -88,6 +90,8 @@ def write_report(
         The microscope.
     volume, grid
         A reconstruction of shape `grid.volume_shape`, and the positions of its voxels.
+    deviation
+        Standard deviation of each voxel of `volume`.
     surface
         Sheets, as `read_surface` reads them.
     points
@@ -112,12 +116,14 @@ def write_report(
     InputError
         As `check_output`, for `.html`, before any work; if `tolerance` has other contents.
     ValueError
-        If a volume has no grid, or another shape than its grid.
+        If a volume has no grid, or another shape than its grid; if `deviation` has another shape than the volume.
     """
     path, progress = check_output(path, [".html"]), progress or Progress()
     page = template("report.html")
     if volume is not None and (grid is None or volume.shape != grid.volume_shape):
         raise ValueError(f"`volume` must have the shape of `grid`, got {volume.shape}.")
+    if deviation is not None and (volume is None or deviation.shape != volume.shape):
+        raise ValueError(f"`deviation` must have the shape of `volume`, got {deviation.shape}.")
     context = {
         "design": design,
         "notes": dict.fromkeys(("page", "capture", "volume", "points"), "") | dict(notes or {}),
@@ -143,6 +149,10 @@ def write_report(
                 "html": volume_html(volume, grid, max_bytes=SLICE_BYTES),
             }
             views["volume"] = voxel_view(volume, grid)
+            if deviation is not None:
+                deviation = np.asarray(deviation)
+                context["volume"]["deviation"] = figure_uri(_draw_deviation(volume, deviation, grid))
+                context["volume"]["sure"] = format_deviation(volume, deviation)
         if surface is not None:
             context["surface"] = {"shape": surface.depth.shape, "pitch_um": 1000 * surface.grid.pitch}
             context["surface"]["picture"] = figure_uri(_draw_sheets(surface))
@@ -359,6 +369,20 @@ def _draw_sheets(maps: SurfaceMaps) -> Figure:
         error = f", SD {np.nanmedian(sd):.2g} mm at the median" if np.isfinite(sd).any() else ""
         for axes, title in zip(row, ("brightness", "depth"), strict=True):
             axes.set(title=title + name + (error if title == "depth" else ""), xlabel="x, mm", ylabel="y, mm")
+    return figure
+
+
+def _draw_deviation(volume: np.ndarray, deviation: np.ndarray, grid: Grid) -> Figure:
+    """Brightness and standard deviation of the brightest voxel of each column, on one scale."""
+    deepest = volume.argmax(0)[None]
+    maps = [np.take_along_axis(part, deepest, 0)[0] for part in (volume, deviation)]
+    high = max(float(np.percentile(maps[0], 99.8)), 1e-12)
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    both = figure.subplots(1, 2)
+    for axes, part, title in zip(both, maps, ("brightness", "standard deviation"), strict=True):
+        axes.imshow(part, "viridis", vmin=0, vmax=high, extent=grid.extent)
+        axes.set(title=title, xlabel="x, mm", ylabel="y, mm")
+    figure.colorbar(both[0].images[0], ax=both)
     return figure
 
 

@@ -120,6 +120,19 @@ def check_finite(name: str, values: Shaped[Array | np.ndarray, "..."], parts: st
         raise input_error(name, "finite", f"{wrong} of {values.size} {parts} NaN or infinite")
 
 
+def flat_warning(volume: Float[np.ndarray, "..."]) -> str | None:
+    """A warning of a result that shows nothing, because all of its voxels are equal; None otherwise.
+
+    Raises `InputError` for one that is not finite.
+    """
+    check_finite("the result", volume, "voxels")
+    low, high = volume.min(), volume.max()
+    if low < high or volume.size == 1:
+        return None
+    value = "zero: nothing in the capture is light that the model explains" if low == 0 else f"{low:.3g}"
+    return f"the result shows nothing, all of its voxels are {value}"
+
+
 def check_real(name: str, values: Shaped[Array | np.ndarray, "..."]) -> None:
     """Raise `InputError` if an array is complex: JAX would drop the imaginary part."""
     if jnp.issubdtype(values.dtype, jnp.complexfloating):

@@ -19,6 +19,7 @@ def report_command(
     volume: Path | None = None,
     *,
     output: Path,
+    deviation: Path | None = None,
     points: Path | None = None,
     surface: Path | None = None,
     traces: Path | None = None,
@@ -38,6 +39,7 @@ def report_command(
 
     Options:
         output: REPORT.html.
+        deviation: DEVIATION.ome.tif of `gs-jax reconstruct`: the standard deviation of VOLUME.
         points: POINTS.csv: points for a table and a 3-D view.
         surface: SURFACE.ome.tif of `gs-jax reconstruct`: maps and a 3-D view.
         traces: TRACES.csv or .h5 of `gs-jax traces`: its regions, and their signals over time.
@@ -48,9 +50,9 @@ def report_command(
     from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
     from ..io.traces import read_traces
-    from ..io.volumes import read_surface, read_volume
+    from ..io.volumes import read_deviation, read_surface, read_volume
 
-    inputs = (design, volume, points, surface, traces, capture, tolerance)
+    inputs = (design, volume, deviation, points, surface, traces, capture, tolerance)
     if not capture and (given := given_options(CAPTURE_OPTIONS)):
         raise InputError(f"{given[0]} must be used with --capture.")
     with needs_extra("report"):
@@ -59,8 +61,12 @@ def report_command(
     if volume and volume.suffix.lower() in (".csv", ".toml"):
         raise input_error("VOLUME", ".ome.tif or .zarr (points are given by --points)", volume.suffix, volume)
     microscope, results = light.read_design(design), {}
+    if deviation and not volume:
+        raise InputError("--deviation must be used with VOLUME, whose voxels it describes.")
     if volume:
         results["volume"], results["grid"] = read_volume(volume)
+        if deviation:
+            results["deviation"] = read_deviation(deviation, results["grid"])
     if surface:
         results["surface"] = read_surface(surface)
     if points:

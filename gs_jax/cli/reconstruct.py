@@ -9,9 +9,10 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
+from ..base.arrays import flat_warning
 from ..base.errors import InputError, input_error, needs_extra
 from ..base.progress import Progress
-from ..io.files import check_output
+from ..io.files import TIFF_SUFFIXES, check_output
 from .channels import reconstruct_channels
 from .commands import (
     RESUMABLE,
@@ -95,6 +96,7 @@ def reconstruct_command(
     points: Path | None = None,
     surface: Path | None = None,
     score: bool = False,
+    deviation: Path | None = None,
     tiles: TileSide | None = None,
     light: DepthLight,
     recording: RecordingOptions,
@@ -130,16 +132,19 @@ def reconstruct_command(
             in mm.
         score: Also reconstruct four times without a quarter of the lenses, predict their light, and tell how well: a
             score without ground truth.
+        deviation: DEVIATION.ome.tif: also write the standard deviation of each voxel, by the reconstructions
+            of --score.
         tiles: Compute and write a large volume to VOLUME.zarr in tiles, squares of so many voxels a side, or of as many
             as fit into memory. --resume, --workers and --scheduler are as for recordings.
     """
     from ..design.design import read_design
     from ..io.point_tables import write_points
-    from ..io.provenance import INTENSITY, SCORE, DepthFrame
+    from ..io.provenance import DEVIATION, INTENSITY, SCORE, DepthFrame
     from ..io.recordings import open_recording
     from ..io.volumes import SURFACE_SUFFIXES, VOLUME_SUFFIXES, write_surface, write_volume
     from ..linear.linear_map import compiled_for_cpu
     from ..reconstruction.plan import Plan
+    from ..reconstruction.residual import format_deviation
 
     check_output(output, VOLUME_SUFFIXES)
     check_even(output, depths)
@@ -147,9 +152,8 @@ def reconstruct_command(
         check_output(surface, SURFACE_SUFFIXES)
         if options.method != "surface":
             raise InputError(f"--surface must be used with --method surface, got {options.method}.")
-    if score and (options.suppress != "none" or options.method == "surface"):
-        got = f"--suppress {options.suppress} and --method {options.method}"
-        raise InputError(f"--score must be used with --suppress none and methods of free voxels, got {got}.")
+    if deviation:
+        check_output(deviation, TIFF_SUFFIXES)
     if output.suffix.lower() == ".zarr":
         with needs_extra("zarr"):
             import_module("zarr")
@@ -167,7 +171,8 @@ def reconstruct_command(
     for path in tracks:
         check_output(path, [path.suffix])
     inputs = (capture, design, options.weights, *camera.files)
-    check_may_write(None if recording.resume else output, points, surface, *tracks, inputs=inputs, force=force)
+    outputs = (None if recording.resume else output, points, surface, deviation, *tracks)
+    check_may_write(*outputs, inputs=inputs, force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)
@@ -182,6 +187,8 @@ def reconstruct_command(
     further: dict[str, Any] = {"points": points is not None, "warm_start": bool(recording.warm_start)}
     further["in_tiles"] = tiles is not None
     plan = Plan.from_options(imager, from_array, voxel_um and voxel_um / 1000, **vars(options), **further)
+    if score or deviation:
+        plan.check_scored("--score" if score else "--deviation")
     series = SeriesRun(capture, output, points, plan, camera, frame, microscope, recording, workers, force)
     if recording.watch:
         series.check(None)
@@ -200,13 +207,17 @@ def reconstruct_command(
         with compiled_for_cpu("xla") if is_single_pass else nullcontext():
             result = reconstruct(image, progress)
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
-        predicted = _format_score(plan.score(image, progress)) if score else None
+        validation = plan.score(image, progress) if score or deviation else None
+        predicted = _format_score(validation) if score else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, options.weights, *camera.files, design=microscope))
             provenance |= frame.note if imager.sample is not None else {}
             provenance |= {SCORE: predicted} if predicted else {}
             provenance |= {} if result.sieve is None else {"sieve": f"{result.sieve:.3g} voxels"}
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)
+            if deviation and validation:
+                own = provenance | {DEVIATION: f"of the voxels of {output.name}"}
+                write_volume(deviation, validation.deviation, frame.grid(plan.grid), own)
             if points and result.points is not None:
                 write_points(points, *frame.points(result.points, result.statistics), provenance=provenance | INTENSITY)
             if surface and (fit := result.surface):
@@ -220,6 +231,8 @@ def reconstruct_command(
         click.echo(f"{output}: --sieve {result.sieve:.3g}, chosen by held-out pixels")
     if predicted:
         click.echo(f"{output}: {predicted}")
+    if deviation and validation:
+        click.echo(f"{deviation}: {format_deviation(result.volume, validation.deviation)}")
     if fit := result.surface:
         others = f"one more {fit.further_error:.1%}, free voxels {fit.free_error:.1%}"
         click.echo(f"{surface or output}: sheets leave {fit.error:.1%} of the capture unexplained (RMS), {others}")
@@ -390,6 +403,7 @@ def deconvolve_command(
                 image, system, solver, choose=choose, stop_at_discrepancy=stop_at_noise, progress=progress
             )
             volume = result.scene
+        flat = flat_warning(volume)
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, *files))
             if result and result.smoothness:
@@ -403,6 +417,8 @@ def deconvolve_command(
         at = [f"at {depth:g} mm" for depth in depths] if depths else [f"is plane {n + 1}" for n in range(len(names))]
         click.echo(f"PSFs: {', '.join(f'{name} {place}' for name, place in zip(names, at, strict=True))}")
     _warn_of_cut_psfs(planes)
+    if flat:
+        print_warning(flat)
     if fit:
         click.echo(
             f"{psf_places}: {fit.rank} components explain {len(spots)} PSFs to {fit.error:.2g} of their RMS, those at "

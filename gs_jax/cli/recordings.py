@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
+from ..base.arrays import flat_warning
 from ..base.errors import InputError, InputWarning
 from ..base.machine import accelerator, copy_to
 from ..base.progress import Progress
@@ -24,7 +25,7 @@ from .commands import RESUMABLE, OptionGroup, given_options, partial_outputs, pl
 from .options import CaptureOptions, Number, Parsed, objects_in, voxels
 
 # Options that must not be given with tiles.
-_WHOLE = ("points", "surface", "score", "suppress", "stop_at_noise")
+_WHOLE = ("points", "surface", "score", "deviation", "suppress", "stop_at_noise")
 _WHOLE += ("watch", "frame_interval", "track", "track_memory", "warm_start")
 # Failed frames that are named; others are only counted, and listed in the journal.
 _MAX_NAMED = 10
@@ -124,7 +125,7 @@ class SeriesRun:
             raise InputError(
                 "--workers and --scheduler must not be given with --watch, which makes one volume at a time."
             )
-        if given := given_options(("surface", "score")):
+        if given := given_options(("surface", "score", "deviation")):
             got = "--watch" if recording is None else f"{len(recording.names)} frames"
             raise InputError(f"{given[0]} must be used with a single capture, got {got}.")
         if not (options.resume or self.force):
@@ -321,7 +322,11 @@ class SeriesRun:
 
 
 def print_failed_tiles(series) -> int:
-    """Name the tiles of a volume that failed and are empty; return the exit status."""
+    """Name the tiles of a volume that failed and are empty, warn if all is flat; return the exit status."""
+    from ..io.ngff import open_levels
+
+    if series.exists and (text := flat_warning(np.asarray(open_levels(series.path, series.grid)[-1][:]))):
+        print_warning(text)
     for number, reason in series.failed.items():
         click.echo(f"gs-jax: tile {number}: {reason}", err=True)
     return int(bool(series.failed))

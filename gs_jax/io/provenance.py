@@ -34,6 +34,8 @@ Provenance = Mapping[str, str]
 NAMESPACE, KEY = "gs_jax/provenance", "provenance"
 # Key of a volume's cross-validation in words, which a report shows beside the volume.
 SCORE = "score"
+# Key that says of which volume a file has the standard deviations.
+DEVIATION = "standard deviation"
 # What the intensities of points in a capture are.
 INTENSITY = {"intensity": "all light that the point emits, in counts of the capture"}
 

@@ -40,7 +40,7 @@ from .ngff import (
     title,
     um,
 )
-from .provenance import Provenance, annotation, moved, surface_of, write_sidecar
+from .provenance import DEVIATION, Provenance, annotation, moved, read_provenance, surface_of, write_sidecar
 from .remote import import_zarr, open_store, remote_url
 from .tiff import decode_page, decode_plane, open_tiff
 
@@ -156,6 +156,20 @@ def read_volume(path: PathLike) -> tuple[Volume, Grid]:
     if not np.isfinite(voxels).all():
         raise input_error("voxels", "finite", "a NaN or an infinity", path)
     return voxels, grid
+
+
+def read_deviation(path: PathLike, grid: Grid) -> Volume:
+    """Standard deviations of `gs-jax reconstruct --deviation` of the voxels of a grid.
+
+    Raises `InputError` as `read_volume`, for other volumes, and for another grid.
+    """
+    values, own = read_volume(path)
+    if DEVIATION not in read_provenance(path):
+        raise input_error("volume", "the standard deviations of gs-jax reconstruct --deviation", "another volume", path)
+    alike = own.volume_shape == grid.volume_shape
+    if not (alike and np.allclose(own.depths, grid.depths) and math.isclose(own.pitch, grid.pitch, rel_tol=1e-6)):
+        raise input_error("voxels", "those of VOLUME", "those of another grid", path)
+    return values
 
 
 def write_planes(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.arrays import flat_warning
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.typing import Image, Volume
@@ -175,7 +176,7 @@ class Plan:
 
             with progress.step("Suppressing the background"):
                 volume = suppress(volume, network=self.network)
-        return Result(volume, points, statistics, warning, surface, last, sieve)
+        return Result(volume, points, statistics, warning or flat_warning(volume), surface, last, sieve)
 
     def _find_points(self, image: Image, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
         from ..detection.background import subtract_background
@@ -203,6 +204,12 @@ class Plan:
 
     def check(self, volume: Volume, image: Image, progress: Progress) -> ForwardResidual:
         return forward_residual(volume, image, self.imager, self.grid, optics=self.optics, progress=progress)
+
+    def check_scored(self, option: str) -> None:
+        """Raise `InputError` naming an option for which `score` is needed, unless lenses can be left out."""
+        if self.suppress != "none" or isinstance(self.method, Surface):
+            got = f"--suppress {self.suppress} and {type(self.method).__name__}()"
+            raise InputError(f"{option} must be used with --suppress none and methods of free voxels, got {got}.")
 
     def score(self, image: Image, progress: Progress) -> CrossValidation:
         """How well lenses are predicted from the others, without suppression; `InputError` with sheets."""

@@ -1,7 +1,11 @@
-"""How well a volume explains a capture: the forward residual, and cross-validation by lenses that were not used."""
+"""How well a volume explains a capture: the forward residual, and cross-validation by lenses that were not used.
+
+Cross-validation also gives the standard deviation of each voxel, by the jackknife.
+"""
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +24,11 @@ from .pipeline import BackProjection, Method, Reconstructor, check_call, check_s
 
 # Regions along a side of the sensor, unless it has fewer pixels.
 _REGIONS = 16
+# Voxels brighter than this share of the largest are those over which deviations are calibrated.
+BRIGHT = 0.1
+# Factors of the jackknife, and of the brightness around a voxel: with them 68 % of the voxels of ray-traced letters,
+# beads, blobs and a tilted sheet are about right within one deviation, and 95 % within two.
+GAIN, FLOOR = 3.2, 0.6
 
 
 class ForwardResidual(NamedTuple):
@@ -121,12 +130,15 @@ class CrossValidation(NamedTuple):
         The error of each fold, relative to the RMS of its own pixels.
     regions
         The error in squares of the sensor, relative to the whole capture's RMS.
+    deviation
+        Standard deviation of each voxel of the volume from all lenses, in its unit.
     """
 
     error: float
     noise: float
     folds: Float[np.ndarray, " fold"]
     regions: Float[np.ndarray, "row column"]
+    deviation: Volume
 
     @property
     def score_db(self) -> float:
@@ -197,15 +209,42 @@ def cross_validated(
     problem = prepare_model(imager, grid, optics, progress)
     reconstructor = Reconstructor(imager, grid, method, optics, **options)
     light = light_of(image, problem)
-    residual, parts = np.zeros_like(light), []
+    residual, parts, volumes = np.zeros_like(light), [], []
     for kept in progress.track(kept_pixels_of_folds(problem.imager, folds), "Cross-validating"):
-        rest = residual_of(reconstructor.keeping(kept)(image, progress), light, problem, kept)
+        volumes.append(reconstructor.keeping(kept)(image, progress))
+        rest = residual_of(volumes[-1], light, problem, kept)
         left_out = kept == 0
         residual[left_out] = rest[left_out]
         parts.append(relative(rest[left_out], light[left_out]))
     noise, rms = math.sqrt(binned_variance(np.asarray(image), light.shape).mean()), float(np.sqrt(np.mean(light**2)))
     noise = min(noise / rms, 1.0) if rms > 0 else 0.0
-    return CrossValidation(relative(residual, light), noise, np.array(parts), relative_regions(residual, light))
+    parts, regions = np.array(parts), relative_regions(residual, light)
+    return CrossValidation(relative(residual, light), noise, parts, regions, jackknife_deviation(volumes))
+
+
+def jackknife_deviation(volumes: Sequence[Volume]) -> Volume:
+    """Standard deviation of the voxels of a volume from all lenses, by volumes that each lack one fold of lenses.
+
+    The delete-a-group jackknife, `sqrt((m - 1) / m sum((x_i - mean)^2))` of `m` volumes `x_i`, is the deviation of a
+    mean over folds whose errors are independent. Its variance, of `m - 1` degrees of freedom, is averaged over
+    neighbours. Folds do not show what they have in common, such as blur along z: that is taken as a share of the mean
+    brightness around a voxel. Both factors were fitted to ray-traced scenes.
+    """
+    from scipy.ndimage import gaussian_filter  # imported here: back-projection does without SciPy
+
+    count = len(volumes)
+    mean: Any = sum(volumes) / count
+    variance = (count - 1) / count * sum((volume - mean) ** 2 for volume in volumes)
+    known, common = GAIN**2 * gaussian_filter(variance, (0, 1, 1)), FLOOR * gaussian_filter(mean, 1.0)
+    return np.sqrt(known + common**2)
+
+
+def format_deviation(volume: Volume, deviation: Volume) -> str:
+    """The median deviation of bright voxels, relative to their brightness, as text."""
+    bright = volume > max(BRIGHT * float(volume.max()), 0)
+    share = f"{np.median(deviation[bright] / volume[bright]):.0%}" if bright.any() else "unknown"
+    where = f"at the median of voxels brighter than {BRIGHT:.0%} of the largest"
+    return f"standard deviations are {share} of the brightness {where}"
 
 
 def check_scored(image, imager, method, optics):

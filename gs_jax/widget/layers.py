@@ -19,6 +19,7 @@ from ..base.typing import Points
 from ..cli.options import CaptureOptions, depth_range, find_design, parse_depths
 from ..io.ngff import Series, display_range, read_series
 from ..io.point_tables import POINTS_HEADER, read_points
+from ..io.provenance import DEVIATION, read_provenance
 from ..io.volumes import VOLUME_SUFFIXES, SurfaceMaps, read_surface, read_volume, surface_mesh
 from ..microscope.grid import Grid
 
@@ -62,8 +63,11 @@ def prepare_layers(
     suppress: str,
     points: bool,
     progress: CancellableProgress,
+    deviation: bool = False,
 ) -> Callable[[str, Path | np.ndarray], Result]:
     """Returns the function that reconstructs a file, or the pixels of a layer, as `gs-jax reconstruct` does.
+
+    `deviation` adds a layer with the standard deviation of each voxel.
 
     Raises `InputError` as the command.
     """
@@ -77,6 +81,8 @@ def prepare_layers(
     imager = read_design(design).imager()
     options = {"method": method, "suppress": suppress, "points": points}
     plan = Plan.from_options(imager, planes, voxel_um / _UM or None, **options)
+    if deviation:
+        plan.check_scored("Deviation")
     grid, volume_of = plan.grid, plan.prepare(progress)
 
     def reconstruct(name: str, capture: Path | np.ndarray) -> Result:
@@ -91,6 +97,11 @@ def prepare_layers(
             found = volume_of(image, progress)
         progress.check_cancelled()
         layers = [volume_layer(found.volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
+        if deviation:
+            # Below the volume, which stays the layer that is seen.
+            layers.insert(
+                0, deviation_layer(plan.score(image, progress).deviation, grid, f"{name}, standard deviation")
+            )
         if fit := found.surface:
             layers += surface_layers(SurfaceMaps(fit.brightness, fit.depth, fit.depth_sd, grid), name)
         if found.points is not None:
@@ -213,7 +224,8 @@ def _read_volume(path) -> list[Layer]:
             return surface_layers(read_surface(path), Path(path).name)
         except InputError:
             raise ValueError(f"neither a volume nor a surface of gs_jax: {error}") from error
-    return [volume_layer(voxels, grid, Path(path).name)]
+    layer_of = deviation_layer if DEVIATION in read_provenance(path) else volume_layer
+    return [layer_of(voxels, grid, Path(path).name)]
 
 
 def volume_layer(volume: Num[np.ndarray, "depth y x"], grid: Grid, name: str) -> Layer:
@@ -222,6 +234,12 @@ def volume_layer(volume: Num[np.ndarray, "depth y x"], grid: Grid, name: str) ->
     scale = _UM * np.array([mean_step(grid), grid.pitch, grid.pitch])
     options = {"scale": scale, "translate": first, "contrast_limits": display_range(volume), "name": name}
     return volume, options | _AXES, "image"
+
+
+def deviation_layer(deviation: Num[np.ndarray, "depth y x"], grid: Grid, name: str) -> Layer:
+    """Standard deviations of the voxels of a volume."""
+    data, options, kind = volume_layer(deviation, grid, name)
+    return data, options | {"colormap": "viridis"}, kind
 
 
 def mean_step(grid: Grid) -> float:

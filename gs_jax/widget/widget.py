@@ -62,12 +62,13 @@ class Reconstruct(Container):
         self.method = ComboBox(label="Method", choices=METHODS)
         self.suppress = ComboBox(label="Suppress", choices=SUPPRESSIONS, tooltip="Background, after backproject.")
         self.points = CheckBox(label="Find points")
+        self.deviation = CheckBox(label="Deviation", tooltip="Of each voxel, by four more reconstructions.")
         self.run, self.live, self.cancel = (PushButton(text=each) for each in ("Run", "Live", "Cancel"))
         self.cancel.enabled = False
         self.bar, self.status = ProgressBar(label=" "), Label(label=" ", value="")
         buttons = Container(widgets=[self.run, self.live, self.cancel], layout="horizontal", labels=False, label=" ")
         files = self.layer, self.file, self.folder, self.design, self.design_file
-        options = self.depths, self.voxel, self.method, self.suppress, self.points
+        options = self.depths, self.voxel, self.method, self.suppress, self.points, self.deviation
         super().__init__(widgets=[*files, *options, buttons, self.bar, self.status])
         self.voxel.native.setSpecialValueText("default")
         self.status.native.setWordWrap(True)
@@ -114,6 +115,7 @@ class Reconstruct(Container):
             "method": self.method.value,
             "suppress": self.suppress.value,
             "points": self.points.value,
+            "deviation": self.deviation.value,
         }
         self._result = Newest()
         self._done.clear()
