@@ -9,6 +9,7 @@ import tifffile
 
 import gs_jax as gs
 from gs_jax.__main__ import main
+from gs_jax.base.arrays import flat_warning
 from gs_jax.cli.options import parse_depths
 from gs_jax.io.provenance import SCORE, read_provenance
 from gs_jax.io.volumes import read_deviation
@@ -101,6 +102,19 @@ def test_a_score_is_told_and_kept(folder, run):
         status == 2
         and "must be the standard deviations of gs-jax reconstruct --deviation, got another volume (v.tif)" in err
     )
+
+
+def test_a_result_that_shows_nothing_is_said(folder, run):
+    """Also one that is not finite, before it is written."""
+    tifffile.imwrite(folder / "capture.tif", np.zeros((96, 80), np.uint16))
+    status, _, err = run(*RECONSTRUCT[:4], "20", "-o", "v.tif")
+    assert (
+        status == 0 and err.count("\n") == 1 and "warning: the result shows nothing, all of its voxels are zero" in err
+    )
+    with pytest.raises(gs.InputError, match="result must be finite, got 1 of 8 voxels"):
+        flat_warning(np.array([*range(7), np.nan]))
+    assert flat_warning(np.full(3, 2.5)) == "the result shows nothing, all of its voxels are 2.5"
+    assert flat_warning(np.arange(3.0)) is None
 
 
 def test_one_depth_and_the_default_voxel(folder, run):

@@ -12,7 +12,18 @@ from .commands import given_options, print_warning, provenance_of
 from .options import CaptureOptions, DepthLight, voxels
 
 # Options that must not be given with several channels.
-_ONE_CHANNEL = ("points", "surface", "score", "tiles", "watch", "frame_interval", "track", "warm_start", "resume")
+_ONE_CHANNEL = (
+    "points",
+    "surface",
+    "score",
+    "deviation",
+    "tiles",
+    "watch",
+    "frame_interval",
+    "track",
+    "warm_start",
+    "resume",
+)
 _ONE_CHANNEL += ("workers", "scheduler", "wavelength_nm", "bayer")
 
 
