@@ -9,6 +9,7 @@ convolutions with a few kernels, weighted by smooth maps.
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import ShapeDtypeStruct, lax
@@ -136,6 +137,33 @@ def _spectra(kernels: Num[Array | np.ndarray, "kernel high wide"], image_shape: 
     kernels = kernels if jnp.issubdtype(kernels.dtype, jnp.floating) else kernels.astype(float)
     size = scene_size(image_shape, kernels.shape[1:])
     return lax.map(lambda plane: centred_spectrum(plane, size), kernels), size
+
+
+def warp_psf(
+    psf: Float[Array, "high wide"], shift: Float[Array, "2"], scale: Float[Array, ""], blur: Float[Array, ""]
+) -> Float[Array, "high wide"]:
+    """Scale a PSF about its point, shift it, and blur it; its sum stays.
+
+    *Differentiable.*
+
+    Parameters
+    ----------
+    psf
+        Image of a point at `(high // 2, wide // 2)`.
+    shift
+        `(row, column)`, pixels.
+    scale
+        Magnification.
+    blur
+        Standard deviation of a Gaussian, pixels; at 0 the derivative is 0.
+    """
+    middle = jnp.array([n // 2 + 0.5 for n in psf.shape], psf.dtype)
+    scales, translation = jnp.stack([scale, scale]), middle * (1 - scale) + shift
+    moved = jax.image.scale_and_translate(psf, psf.shape, (0, 1), scales, translation, "lanczos3", antialias=False)
+    down, across = (np.fft.fftfreq(psf.shape[0]), np.fft.rfftfreq(psf.shape[1]))
+    squares = jnp.asarray(2 * np.pi**2 * (down[:, None] ** 2 + across**2), psf.dtype)
+    blurred = jnp.fft.irfft2(jnp.fft.rfft2(moved) * jnp.exp(-(blur**2) * squares), psf.shape)
+    return blurred * (psf.sum() / blurred.sum())
 
 
 def scene_size(image_shape: tuple[int, ...], psf_shape: tuple[int, ...]) -> tuple[int, int]:

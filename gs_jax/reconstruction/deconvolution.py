@@ -393,8 +393,8 @@ def choose_smoothness(
     if isinstance(psf, FieldConvolutionOperator):
         side, whole = 1, psf
     else:
-        side = _binning(light.shape, psf.shape)
-        light, spots = _binned(light, side), np.stack([sum_pixels(spot, side) for spot in psf])
+        side = capture_binning(light.shape, psf.shape)
+        light, spots = bin_capture(light, side), np.stack([sum_pixels(spot, side) for spot in psf])
         whole = ConvolutionOperator(spots, light.shape)
     kept = held_out_squares(light.shape)
     system = eqx.tree_at(lambda a: a.kept, whole, jnp.asarray(kept), is_leaf=lambda leaf: leaf is None)
@@ -444,14 +444,14 @@ def _mean_logs(errors):
     return np.log(errors + max(floor, _TINY)).mean(axis=1)
 
 
-def _binning(image_shape, psf_shape):
+def capture_binning(image_shape: tuple[int, ...], psf_shape: tuple[int, ...], voxels: int = _VOXELS) -> int:
     """The least side of squares of pixels with which the scene has few enough voxels."""
-    voxels = psf_shape[0] * math.prod(n + k for n, k in zip(image_shape, psf_shape[1:], strict=True))
-    side = math.ceil(math.sqrt(voxels / _VOXELS))
+    count = psf_shape[0] * math.prod(n + k for n, k in zip(image_shape, psf_shape[1:], strict=True))
+    side = math.ceil(math.sqrt(count / voxels))
     return max(min(side, min(*image_shape, *psf_shape[1:]) // 2), 1)
 
 
-def _binned(light, side):
+def bin_capture(light: Float32[np.ndarray, "row column"], side: int) -> Float32[np.ndarray, "y x"]:
     """The mean of squares of pixels, with noise added so that it is as large as that of a single pixel."""
     if side == 1:
         return light

@@ -1,0 +1,156 @@
+"""Refinement of measured PSFs that do not quite fit: shift, scale and blur, fitted together with the volume.
+
+Two sets of squares of the capture are held out of the volume's fit. The volume from the remaining pixels predicts the
+first set, and the numbers that predict it best are found by Levenberg-Marquardt steps with the total derivative: a
+change of the PSF also changes the volume, through all steps of its solver (bilevel optimization). The second set
+decides whether the result is kept, so numbers that fit noise are not.
+
+A shift of a plane's PSF is a shift of that plane of the volume. Only the smoothness between planes tells these apart,
+and nothing tells a shift of all planes. So shifts have the mean 0, and a single plane has none.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Float32
+
+from ..base.progress import Progress
+from ..linear.measured_psf import ConvolutionOperator, warp_psf
+from ..solvers.admm import ConvolutionADMM
+from ..solvers.base import solve
+from ..solvers.richardson_lucy import hat_functions
+from .deconvolution import bin_capture, capture_binning
+from .inverse_problem import cell_side, held_out_squares, sum_pixels
+
+# Planes that have numbers of their own; those of other planes are interpolated between them.
+_NODES = 5
+# Steps of the volume from nothing, and Levenberg-Marquardt steps.
+_STEPS, _FIT_STEPS = 60, 12
+# Voxels of the scene beyond which pixels are binned.
+_VOXELS = 2**18
+# Initial standard deviation of the blur, pixels: at 0 it has no derivative.
+_FIRST_BLUR = 0.3
+_TINY = 1e-30
+
+
+class PsfFit(NamedTuple):
+    """Refined PSFs, and what was found.
+
+    Parameters
+    ----------
+    psf
+        The refined stack, or the given one if the numbers do not predict held-out pixels better.
+    shift
+        `(row, column)` of each plane, pixels, with the mean 0.
+    scale
+        Magnification of each plane's PSF about its middle.
+    blur
+        Standard deviation of the Gaussian blur of each plane, pixels.
+    before, after
+        RMS error of the second set of held-out pixels by the given PSFs and by the fitted numbers, relative to the RMS
+        of these pixels.
+    """
+
+    psf: Float32[np.ndarray, "depth high wide"]
+    shift: Float[np.ndarray, "depth 2"]
+    scale: Float[np.ndarray, " depth"]
+    blur: Float[np.ndarray, " depth"]
+    before: float
+    after: float
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the numbers predict held-out pixels better than the given PSFs do."""
+        return self.after < self.before
+
+
+def refine_psf(
+    light: Float32[np.ndarray, "row column"],
+    psf: Float32[np.ndarray, "depth high wide"],
+    solver: ConvolutionADMM,
+    progress: Progress | None = None,
+) -> PsfFit:
+    """Fit shift, scale and blur of a measured stack together with the volume.
+
+    *Host.*
+
+    Large captures are binned. Up to five planes have four numbers each; in deeper stacks numbers are linear between
+    five planes.
+
+    Parameters
+    ----------
+    light
+        The capture above its offset, at most of the order of 1.
+    psf
+        PSFs of the sum 1.
+    solver
+        Weights of the volume's fit; its number of steps is not used.
+    progress
+        Shows progress.
+    """
+    side = capture_binning(light.shape, psf.shape, _VOXELS)
+    light, spots = bin_capture(light, side), np.stack([sum_pixels(spot, side) for spot in psf])
+    kept = held_out_squares(light.shape)
+    cells = np.add.outer(*(np.arange(n) // cell_side(light.shape) for n in light.shape)) % 2
+    first, second = ((1 - kept) * (cells == parity) for parity in (0, 1))
+    inner = ConvolutionADMM(_STEPS, 0.0, solver.sparsity, solver.tv, solver.isotropic, solver.tv_z, solver.nonnegative)
+    nodes = min(_NODES, len(psf))
+    hats = np.asarray(hat_functions(len(psf), nodes, float), np.float32) if nodes > 1 else np.ones((1, 1), np.float32)
+    data = _Data(*map(jnp.asarray, (light, spots, kept, first, hats)), inner)
+    given = jnp.zeros((nodes, 4), light.dtype)
+    start = given.at[:, 3].set(_FIRST_BLUR)
+    lm = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+    with (progress or Progress()).step("Refining the PSFs"):
+        error = np.asarray(_error(given, data))
+        # Residuals of the order of 1, for which the first damping of the steps is small.
+        data = eqx.tree_at(lambda d: d.weight, data, data.weight / max(_rms(error, first), _TINY))
+        found = optx.least_squares(_residuals, lm, start, data, max_steps=_FIT_STEPS, throw=False, options={"jac": "fwd"})
+        errors = error, np.asarray(_error(found.value, data))
+    before, after = (_rms(error, second) / max(_rms(light, second), _TINY) for error in errors)
+    shift, scale, blur = (np.asarray(part, np.float64) for part in _numbers(found.value, data.hats, spots.shape))
+    shift, blur = side * shift, side * np.abs(blur)
+    fit = PsfFit(psf, shift, scale, blur, before, after)
+    return fit._replace(psf=np.asarray(_warp(psf, *map(jnp.float32, (shift, scale, blur))))) if fit.is_better else fit
+
+
+def _rms(image, mask):
+    return math.sqrt(float(np.sum(mask * image.astype(np.float64) ** 2)) / max(float(mask.sum()), 1))
+
+
+class _Data(eqx.Module):
+    light: Array
+    spots: Array
+    kept: Array
+    weight: Array
+    hats: Array
+    solver: ConvolutionADMM
+
+
+def _numbers(parameters, hats, shape):
+    """Shift, scale and blur of each plane; parameters are in pixels, those of scales at the PSF's nearer edges."""
+    values = hats @ parameters
+    shift = values[:, :2] - values[:, :2].mean(0)
+    return shift, 1 + values[:, 2] / (min(shape[1:]) / 2), values[:, 3]
+
+
+@jax.jit
+def _warp(spots, shift, scale, blur):
+    return jax.lax.map(lambda plane: warp_psf(*plane), (jnp.asarray(spots), shift, scale, blur))
+
+
+@eqx.filter_jit
+def _error(parameters, data):
+    """Error of all pixels by the volume from those that are kept."""
+    spots = _warp(data.spots, *_numbers(parameters, data.hats, data.spots.shape))
+    A = ConvolutionOperator(spots, data.light.shape, data.kept)
+    scene = solve(A, data.kept * data.light, data.solver, throw=False).value
+    return eqx.tree_at(lambda a: a.kept, A, None).mv(scene) - data.light
+
+
+def _residuals(parameters, data):
+    return data.weight * _error(parameters, data)
