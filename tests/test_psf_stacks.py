@@ -150,6 +150,15 @@ WRONG = {
     "dark": (("dark.npy",), "got no light above the darkest percent in plane 2."),
     "weight": (("psf.tif", "--method", "fista", "--tv-z", "2"), "--tv-z must be used with admm, got --method fista."),
     "page": (("psf.tif", "--psf-page", "4"), "must be 1 to 3, or mean, got --page 4 of 3 pages"),
+    "refined, wiener": (
+        ("psf.tif", "--method", "wiener", "--refine-psf"),
+        "--refine-psf must not be given with",
+    ),
+    "refined, places": (("psf.tif", "--psf-places", "p.csv", "--refine-psf"), "must be used without --psf-places, got"),
+    "refined, tiles": (
+        ("psf.tif", "--tiles", "auto", "--refine-psf"),
+        "must be used without --tiles, got",
+    ),
     "nothing": (("none.tif",), "none.tif: cannot be read: No such file or directory."),
 }
 
@@ -173,7 +182,7 @@ def test_what_does_not_fit_is_refused_in_one_line(folder, case):
     np.save("dark.npy", np.stack([spots()[0], spots()[0] * 0]))
     arguments, words = WRONG[case]
     before = sorted(path.name for path in folder.iterdir())
-    result = deconvolved(*arguments, output="v.zarr" if case in ("zarr", "uneven") else "v.ome.tif")
+    result = deconvolved(*arguments, output="v.zarr" if case in ("zarr", "uneven", "refined, tiles") else "v.ome.tif")
     assert isinstance(result.exception, InputError) and words in str(result.exception)
     assert sorted(path.name for path in folder.iterdir()) == before
 

@@ -249,7 +249,7 @@ def _format_score(score) -> str:
 
 _DECONVOLVERS = ("admm", "fista", "richardson-lucy", "wiener")
 # Options of the methods that take steps.
-_ITERATIVE = ("steps", "stop_at_noise", "psf_places", "tv", "tv_z", "sparsity")
+_ITERATIVE = ("steps", "stop_at_noise", "psf_places", "refine_psf", "tv", "tv_z", "sparsity")
 
 
 @dataclass
@@ -281,6 +281,7 @@ def deconvolve_command(
     stop_at_noise: bool = False,
     psf_page: Page | None = None,
     psf_places: Path | None = None,
+    refine_psf: bool = False,
     binning: Binning = 1,
     output: Path,
     tiles: TileSide | None = None,
@@ -320,6 +321,8 @@ def deconvolve_command(
             [default: a plane for each page]
         psf_places: PLACES.csv, x_mm,y_mm,z_mm, a line for each PSF: of sources all over the field, four or more at each
             z, if the PSF varies over the field.
+        refine_psf: Fit shift, scale and blur of the PSFs together with the scene, kept if they predict held-out pixels
+            better.
         binning: Sum squares of so many pixels a side, of CAPTURE and PSFs alike: 2 takes a quarter of time and memory.
         output: VOLUME.ome.tif, .npy, or .zarr (with --depths and --voxel-um), float32, planes of CAPTURE's size.
         tiles: Compute and write a large scene to VOLUME.zarr in tiles, squares of so many pixels a side, or of as many
@@ -335,6 +338,7 @@ def deconvolve_command(
     from ..reconstruction.deconvolution_tiles import deconvolve_tiles, scene_tiles
     from ..reconstruction.field_fit import fit_field
     from ..reconstruction.pipeline import method_by_name
+    from ..reconstruction.psf_fit import fit_psf
 
     files = [path for path in (*psf, psf_places, *camera.files) if path]
     check_outputs(None if resume else output, STACK_SUFFIXES, inputs=(capture, *files))
@@ -343,6 +347,8 @@ def deconvolve_command(
         raise InputError(f"--tiles must be used with {allowed}.")
     if resume and tiles is None:
         raise InputError("--resume must be used with --tiles.")
+    if refine_psf and (tiles is not None or psf_places):
+        raise InputError(f"--refine-psf must be used without {'--psf-places' if psf_places else '--tiles'}, got both.")
     if not resume and output.suffix.lower() == ".zarr":
         check_replaceable(output, "remove it")
     places, solver = None, None
@@ -362,7 +368,7 @@ def deconvolve_command(
     check_even(output, depths)
     if depths and depths[0] <= 0 and voxel_um and output.suffix.lower() != ".npy":
         raise input_error("z_mm", "positive with --voxel-um", f"{depths[0]:g}", psf_places)
-    names, fit, result = spot_names(psf, psf_page), None, None
+    names, fit, refined, result = spot_names(psf, psf_page), None, None, None
     with Progress() as progress:
         with progress.step("Reading"):
             image = bin_pixels(camera.read(capture), binning)
@@ -398,7 +404,8 @@ def deconvolve_command(
                 volume = filter_image(image, spots)[None]
         else:
             choose = method == "admm" and weights.tv is None
-            system = fit.operator if fit else spots
+            refined = fit_psf(image, spots, solver, choose=choose, progress=progress) if refine_psf else None
+            system = fit.operator if fit else refined.psf if refined else spots
             result = run_deconvolution(
                 image, system, solver, choose=choose, stop_at_discrepancy=stop_at_noise, progress=progress
             )
@@ -408,6 +415,7 @@ def deconvolve_command(
             provenance = camera.recorded(provenance_of(capture, *files))
             if result and result.smoothness:
                 provenance |= {"tv": f"{result.smoothness.tv:.3g}, chosen from the capture"}
+            provenance |= {"refined PSF": _format_psf_fit(refined)} if refined else {}
             if len(volume) == 1 and not depths:
                 write_capture(output, volume[0], provenance)
             else:
@@ -424,6 +432,8 @@ def deconvolve_command(
             f"{psf_places}: {fit.rank} components explain {len(spots)} PSFs to {fit.error:.2g} of their RMS, those at "
             f"other places predict one to {fit.left_out_error:.2g}; places fit to {fit.place_error:.2g} pixels"
         )
+    if refined:
+        click.echo(f"refined PSF: {_format_psf_fit(refined)}")
     z, rows, columns = volume.shape
     of = "" if z == 1 and not depths else f"{depth_range(depths)}, " if depths else f"{z} planes, "
     taken = f", {result.steps} steps" if result else ""
@@ -440,6 +450,17 @@ def _print_smoothness(chosen):
             f"smoothness: --tv {chosen.tv:.1g}, which predicts held-out pixels best of {len(chosen.tried)} weights, to "
             f"{error:.2g} of their RMS"
         )
+
+
+def _format_psf_fit(fit) -> str:
+    """What the refinement of the PSFs found, in a line."""
+    error = f"error of held-out pixels {fit.before:.3g} -> {fit.after:.3g} of their RMS"
+    if not fit.is_better:
+        return f"kept as measured, shift, scale and blur do not help ({error})"
+    low, high = fit.scale.min(), fit.scale.max()
+    scale = f"{low:.4f}" if high - low < 1e-4 else f"{low:.4f} to {high:.4f}"
+    moved = f"shift up to {np.abs(fit.shift).max():.2f} pixels, " if len(fit.psf) > 1 else ""
+    return f"{moved}scale {scale}, blur up to {fit.blur.max():.2f} pixels ({error})"
 
 
 def _print_quality(result):

@@ -9,6 +9,7 @@ A shift of a plane's PSF is a shift of that plane of the volume. Only the smooth
 and nothing tells a shift of all planes. So shifts have the mean 0, and a single plane has none.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -17,14 +18,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Array, Float, Float32, Num
 
 from ..base.progress import Progress
+from ..base.typing import Image
 from ..linear.measured_psf import ConvolutionOperator, warp_psf
 from ..solvers.admm import ConvolutionADMM
 from ..solvers.base import solve
 from ..solvers.richardson_lucy import hat_functions
-from .deconvolution import bin_capture, capture_binning
+from .deconvolution import (
+    Deconvolver,
+    bin_capture,
+    capture_binning,
+    choose_smoothness,
+    light_and_unit,
+    normalise_spots,
+)
 from .inverse_problem import cell_side, held_out_squares, sum_pixels
 
 # Planes that have numbers of their own; those of other planes are interpolated between them.
@@ -69,10 +78,12 @@ class PsfFit(NamedTuple):
         return self.after < self.before
 
 
-def refine_psf(
-    light: Float32[np.ndarray, "row column"],
-    psf: Float32[np.ndarray, "depth high wide"],
-    solver: ConvolutionADMM,
+def fit_psf(
+    image: Image,
+    psf: Num[Array | np.ndarray, "*depth high wide"],
+    solver: Deconvolver | None = None,
+    *,
+    choose: bool = False,
     progress: Progress | None = None,
 ) -> PsfFit:
     """Fit shift, scale and blur of a measured stack together with the volume.
@@ -84,32 +95,43 @@ def refine_psf(
 
     Parameters
     ----------
-    light
-        The capture above its offset, at most of the order of 1.
-    psf
-        PSFs of the sum 1.
+    image, psf, progress
+        As for `deconvolve`.
     solver
-        Weights of the volume's fit; its number of steps is not used.
-    progress
-        Shows progress.
+        Its weights are those of the volume's fit if it is `ConvolutionADMM`; by default, and for other solvers, the
+        weight of total variation is chosen from the capture.
+    choose
+        Choose the weight also if the solver has one.
+
+    Raises
+    ------
+    InputError
+        As by `deconvolve`.
     """
+    light, psf = light_and_unit(image)[0], normalise_spots(psf, np.shape(image))
+    if choose or not isinstance(solver, ConvolutionADMM):
+        solver = solver if isinstance(solver, ConvolutionADMM) else ConvolutionADMM(_STEPS, sparsity=0.0)
+        solver = dataclasses.replace(solver, tv=choose_smoothness(light, psf, solver, progress).tv)
     side = capture_binning(light.shape, psf.shape, _VOXELS)
     light, spots = bin_capture(light, side), np.stack([sum_pixels(spot, side) for spot in psf])
     kept = held_out_squares(light.shape)
     cells = np.add.outer(*(np.arange(n) // cell_side(light.shape) for n in light.shape)) % 2
     first, second = ((1 - kept) * (cells == parity) for parity in (0, 1))
-    inner = ConvolutionADMM(_STEPS, 0.0, solver.sparsity, solver.tv, solver.isotropic, solver.tv_z, solver.nonnegative)
+    # An edge has 1 / side as many binned pixels, an area 1 / side^2.
+    inner = dataclasses.replace(solver, steps=_STEPS, tolerance=0.0, tv=solver.tv / side)
     nodes = min(_NODES, len(psf))
     hats = np.asarray(hat_functions(len(psf), nodes, float), np.float32) if nodes > 1 else np.ones((1, 1), np.float32)
     data = _Data(*map(jnp.asarray, (light, spots, kept, first, hats)), inner)
-    given = jnp.zeros((nodes, 4), light.dtype)
-    start = given.at[:, 3].set(_FIRST_BLUR)
+    given = jnp.zeros((nodes, 4 if nodes > 1 else 2), light.dtype)
+    start = given.at[:, 1].set(_FIRST_BLUR)
     lm = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
     with (progress or Progress()).step("Refining the PSFs"):
         error = np.asarray(_error(given, data))
         # Residuals of the order of 1, for which the first damping of the steps is small.
         data = eqx.tree_at(lambda d: d.weight, data, data.weight / max(_rms(error, first), _TINY))
-        found = optx.least_squares(_residuals, lm, start, data, max_steps=_FIT_STEPS, throw=False, options={"jac": "fwd"})
+        found = optx.least_squares(
+            _residuals, lm, start, data, max_steps=_FIT_STEPS, throw=False, options={"jac": "fwd"}
+        )
         errors = error, np.asarray(_error(found.value, data))
     before, after = (_rms(error, second) / max(_rms(light, second), _TINY) for error in errors)
     shift, scale, blur = (np.asarray(part, np.float64) for part in _numbers(found.value, data.hats, spots.shape))
@@ -132,10 +154,14 @@ class _Data(eqx.Module):
 
 
 def _numbers(parameters, hats, shape):
-    """Shift, scale and blur of each plane; parameters are in pixels, those of scales at the PSF's nearer edges."""
+    """Shift, scale and blur of each plane.
+
+    Parameters are scale and blur, and row and column of several planes' shifts: all in pixels, scales at the PSF's
+    nearer edges.
+    """
     values = hats @ parameters
-    shift = values[:, :2] - values[:, :2].mean(0)
-    return shift, 1 + values[:, 2] / (min(shape[1:]) / 2), values[:, 3]
+    shift = values[:, 2:] - values[:, 2:].mean(0) if len(values) > 1 else jnp.zeros((1, 2), values.dtype)
+    return shift, 1 + values[:, 0] / (min(shape[1:]) / 2), values[:, 1]
 
 
 @jax.jit
