@@ -321,7 +321,7 @@ def deconvolve_command(
             [default: a plane for each page]
         psf_places: PLACES.csv, x_mm,y_mm,z_mm, a line for each PSF: of sources all over the field, four or more at each
             z, if the PSF varies over the field.
-        refine_psf: Fit shift, scale and blur of the PSFs together with the scene, kept if they predict held-out pixels
+        refine_psf: Fit scale and blur of the PSFs together with the scene, kept if they predict held-out pixels
             better.
         binning: Sum squares of so many pixels a side, of CAPTURE and PSFs alike: 2 takes a quarter of time and memory.
         output: VOLUME.ome.tif, .npy, or .zarr (with --depths and --voxel-um), float32, planes of CAPTURE's size.
@@ -456,11 +456,10 @@ def _format_psf_fit(fit) -> str:
     """What the refinement of the PSFs found, in a line."""
     error = f"error of held-out pixels {fit.before:.3g} -> {fit.after:.3g} of their RMS"
     if not fit.is_better:
-        return f"kept as measured, shift, scale and blur do not help ({error})"
+        return f"kept as measured, scale and blur do not help ({error})"
     low, high = fit.scale.min(), fit.scale.max()
     scale = f"{low:.4f}" if high - low < 1e-4 else f"{low:.4f} to {high:.4f}"
-    moved = f"shift up to {np.abs(fit.shift).max():.2f} pixels, " if len(fit.psf) > 1 else ""
-    return f"{moved}scale {scale}, blur up to {fit.blur.max():.2f} pixels ({error})"
+    return f"scale {scale}, blur up to {fit.blur.max():.2f} pixels ({error})"
 
 
 def _print_quality(result):

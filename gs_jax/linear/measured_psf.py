@@ -140,9 +140,9 @@ def _spectra(kernels: Num[Array | np.ndarray, "kernel high wide"], image_shape: 
 
 
 def warp_psf(
-    psf: Float[Array, "high wide"], shift: Float[Array, "2"], scale: Float[Array, ""], blur: Float[Array, ""]
+    psf: Float[Array, "high wide"], scale: Float[Array, ""], blur: Float[Array, ""]
 ) -> Float[Array, "high wide"]:
-    """Scale a PSF about its point, shift it, and blur it; its sum stays.
+    """Scale a PSF about its point, and blur it; its sum stays.
 
     *Differentiable.*
 
@@ -150,19 +150,18 @@ def warp_psf(
     ----------
     psf
         Image of a point at `(high // 2, wide // 2)`.
-    shift
-        `(row, column)`, pixels.
     scale
         Magnification.
     blur
         Standard deviation of a Gaussian, pixels; at 0 the derivative is 0.
     """
     middle = jnp.array([n // 2 + 0.5 for n in psf.shape], psf.dtype)
-    scales, translation = jnp.stack([scale, scale]), middle * (1 - scale) + shift
+    scales, translation = jnp.stack([scale, scale]), middle * (1 - scale)
     moved = jax.image.scale_and_translate(psf, psf.shape, (0, 1), scales, translation, "lanczos3", antialias=False)
     down, across = (np.fft.fftfreq(psf.shape[0]), np.fft.rfftfreq(psf.shape[1]))
     squares = jnp.asarray(2 * np.pi**2 * (down[:, None] ** 2 + across**2), psf.dtype)
-    blurred = jnp.fft.irfft2(jnp.fft.rfft2(moved) * jnp.exp(-(blur**2) * squares), psf.shape)
+    spectrum, passed = jnp.fft.rfft2(moved), jnp.exp(-(blur**2) * squares)
+    blurred = jnp.fft.irfft2(lax.complex(passed * spectrum.real, passed * spectrum.imag), psf.shape)
     return blurred * (psf.sum() / blurred.sum())
 
 

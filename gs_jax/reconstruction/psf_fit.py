@@ -1,12 +1,11 @@
-"""Refinement of measured PSFs that do not quite fit: shift, scale and blur, fitted together with the volume.
+"""Refinement of measured PSFs that do not quite fit: scale and blur, fitted together with the volume.
 
 Two sets of squares of the capture are held out of the volume's fit. The volume from the remaining pixels predicts the
 first set, and the numbers that predict it best are found by Levenberg-Marquardt steps with the total derivative: a
 change of the PSF also changes the volume, through all steps of its solver (bilevel optimization). The second set
 decides whether the result is kept, so numbers that fit noise are not.
 
-A shift of a plane's PSF is a shift of that plane of the volume. Only the smoothness between planes tells these apart,
-and nothing tells a shift of all planes. So shifts have the mean 0, and a single plane has none.
+Shifts are not fitted: no capture tells a shift of a plane's PSF from a shift of that plane of the volume.
 """
 
 import dataclasses
@@ -37,11 +36,11 @@ from .deconvolution import (
 from .inverse_problem import cell_side, held_out_squares, sum_pixels
 
 # Planes that have numbers of their own; those of other planes are interpolated between them.
-_NODES = 5
+_NODES = 3
 # Steps of the volume from nothing, and Levenberg-Marquardt steps.
-_STEPS, _FIT_STEPS = 60, 12
+_STEPS, _FIT_STEPS = 60, 8
 # Voxels of the scene beyond which pixels are binned.
-_VOXELS = 2**18
+_VOXELS = 2**17
 # Initial standard deviation of the blur, pixels: at 0 it has no derivative.
 _FIRST_BLUR = 0.3
 _TINY = 1e-30
@@ -54,8 +53,6 @@ class PsfFit(NamedTuple):
     ----------
     psf
         The refined stack, or the given one if the numbers do not predict held-out pixels better.
-    shift
-        `(row, column)` of each plane, pixels, with the mean 0.
     scale
         Magnification of each plane's PSF about its middle.
     blur
@@ -66,7 +63,6 @@ class PsfFit(NamedTuple):
     """
 
     psf: Float32[np.ndarray, "depth high wide"]
-    shift: Float[np.ndarray, "depth 2"]
     scale: Float[np.ndarray, " depth"]
     blur: Float[np.ndarray, " depth"]
     before: float
@@ -86,12 +82,12 @@ def fit_psf(
     choose: bool = False,
     progress: Progress | None = None,
 ) -> PsfFit:
-    """Fit shift, scale and blur of a measured stack together with the volume.
+    """Fit scale and blur of a measured stack together with the volume.
 
     *Host.*
 
-    Large captures are binned. Up to five planes have four numbers each; in deeper stacks numbers are linear between
-    five planes.
+    Large captures are binned. Up to three planes have two numbers each; in deeper stacks both are linear in depth
+    between the first, the middle and the last plane.
 
     Parameters
     ----------
@@ -119,12 +115,13 @@ def fit_psf(
     first, second = ((1 - kept) * (cells == parity) for parity in (0, 1))
     # An edge has 1 / side as many binned pixels, an area 1 / side^2.
     inner = dataclasses.replace(solver, steps=_STEPS, tolerance=0.0, tv=solver.tv / side)
+    inner = jax.tree.map(jnp.asarray, inner)
     nodes = min(_NODES, len(psf))
     hats = np.asarray(hat_functions(len(psf), nodes, float), np.float32) if nodes > 1 else np.ones((1, 1), np.float32)
     data = _Data(*map(jnp.asarray, (light, spots, kept, first, hats)), inner)
-    given = jnp.zeros((nodes, 4 if nodes > 1 else 2), light.dtype)
+    given = jnp.zeros((nodes, 2))
     start = given.at[:, 1].set(_FIRST_BLUR)
-    lm = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+    lm = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-2)
     with (progress or Progress()).step("Refining the PSFs"):
         error = np.asarray(_error(given, data))
         # Residuals of the order of 1, for which the first damping of the steps is small.
@@ -134,10 +131,12 @@ def fit_psf(
         )
         errors = error, np.asarray(_error(found.value, data))
     before, after = (_rms(error, second) / max(_rms(light, second), _TINY) for error in errors)
-    shift, scale, blur = (np.asarray(part, np.float64) for part in _numbers(found.value, data.hats, spots.shape))
-    shift, blur = side * shift, side * np.abs(blur)
-    fit = PsfFit(psf, shift, scale, blur, before, after)
-    return fit._replace(psf=np.asarray(_warp(psf, *map(jnp.float32, (shift, scale, blur))))) if fit.is_better else fit
+    scale, blur = (
+        np.asarray(part, np.float64) for part in _numbers(found.value.astype(light.dtype), data.hats, spots.shape)
+    )
+    blur = side * np.abs(blur)
+    fit = PsfFit(psf, scale, blur, before, after)
+    return fit._replace(psf=np.asarray(_warp(psf, *map(jnp.float32, (scale, blur))))) if fit.is_better else fit
 
 
 def _rms(image, mask):
@@ -154,29 +153,24 @@ class _Data(eqx.Module):
 
 
 def _numbers(parameters, hats, shape):
-    """Shift, scale and blur of each plane.
-
-    Parameters are scale and blur, and row and column of several planes' shifts: all in pixels, scales at the PSF's
-    nearer edges.
-    """
+    """Scale and blur of each plane; parameters are in pixels, those of scales at the PSF's nearer edges."""
     values = hats @ parameters
-    shift = values[:, 2:] - values[:, 2:].mean(0) if len(values) > 1 else jnp.zeros((1, 2), values.dtype)
-    return shift, 1 + values[:, 0] / (min(shape[1:]) / 2), values[:, 1]
+    return 1 + values[:, 0] / (min(shape[1:]) / 2), values[:, 1]
 
 
 @jax.jit
-def _warp(spots, shift, scale, blur):
-    return jax.lax.map(lambda plane: warp_psf(*plane), (jnp.asarray(spots), shift, scale, blur))
+def _warp(spots, scale, blur):
+    return jax.lax.map(lambda plane: warp_psf(*plane), (jnp.asarray(spots), scale, blur))
 
 
 @eqx.filter_jit
 def _error(parameters, data):
     """Error of all pixels by the volume from those that are kept."""
-    spots = _warp(data.spots, *_numbers(parameters, data.hats, data.spots.shape))
+    spots = _warp(data.spots, *_numbers(parameters.astype(data.light.dtype), data.hats, data.spots.shape))
     A = ConvolutionOperator(spots, data.light.shape, data.kept)
     scene = solve(A, data.kept * data.light, data.solver, throw=False).value
     return eqx.tree_at(lambda a: a.kept, A, None).mv(scene) - data.light
 
 
 def _residuals(parameters, data):
-    return data.weight * _error(parameters, data)
+    return (data.weight * _error(parameters, data)).astype(parameters.dtype)
