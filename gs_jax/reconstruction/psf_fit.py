@@ -115,10 +115,10 @@ def fit_psf(
     first, second = ((1 - kept) * (cells == parity) for parity in (0, 1))
     # An edge has 1 / side as many binned pixels, an area 1 / side^2.
     inner = dataclasses.replace(solver, steps=_STEPS, tolerance=0.0, tv=solver.tv / side)
-    inner = jax.tree.map(jnp.asarray, inner)
     nodes = min(_NODES, len(psf))
     hats = np.asarray(hat_functions(len(psf), nodes, float), np.float32) if nodes > 1 else np.ones((1, 1), np.float32)
-    data = _Data(*map(jnp.asarray, (light, spots, kept, first, hats)), inner)
+    # Weights, too, are arguments of the program.
+    data = jax.tree.map(jnp.asarray, _Data(light, spots, kept, first, hats, inner))
     given = jnp.zeros((nodes, 2))
     start = given.at[:, 1].set(_FIRST_BLUR)
     lm = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-2)
@@ -144,11 +144,11 @@ def _rms(image, mask):
 
 
 class _Data(eqx.Module):
-    light: Array
-    spots: Array
-    kept: Array
-    weight: Array
-    hats: Array
+    light: Float[Array | np.ndarray, "row column"]
+    spots: Float[Array | np.ndarray, "depth high wide"]
+    kept: Float[Array | np.ndarray, "row column"]
+    weight: Float[Array | np.ndarray, "row column"]
+    hats: Float[Array | np.ndarray, "depth node"]
     solver: ConvolutionADMM
 
 
