@@ -456,10 +456,8 @@ def _format_psf_fit(fit) -> str:
     """What the refinement of the PSFs found, in a line."""
     error = f"error of held-out pixels {fit.before:.3g} -> {fit.after:.3g} of their RMS"
     if not fit.is_better:
-        return f"kept as measured, scale and blur do not help ({error})"
-    low, high = fit.scale.min(), fit.scale.max()
-    scale = f"{low:.4f}" if high - low < 1e-4 else f"{low:.4f} to {high:.4f}"
-    return f"scale {scale}, blur up to {fit.blur.max():.2f} pixels ({error})"
+        return f"kept as measured, no scale within 5 % and blur help ({error})"
+    return f"scale {fit.scale:.4f}, blur {fit.blur:.2f} pixels ({error})"
 
 
 def _print_quality(result):

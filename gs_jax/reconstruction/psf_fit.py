@@ -6,6 +6,7 @@ change of the PSF also changes the volume, through all steps of its solver (bile
 decides whether the result is kept, so numbers that fit noise are not.
 
 Shifts are not fitted: no capture tells a shift of a plane's PSF from a shift of that plane of the volume.
+Nor has each plane numbers of its own: with these, planes would move in depth.
 """
 
 import dataclasses
@@ -24,7 +25,6 @@ from ..base.typing import Image
 from ..linear.measured_psf import ConvolutionOperator, warp_psf
 from ..solvers.admm import ConvolutionADMM
 from ..solvers.base import solve
-from ..solvers.richardson_lucy import hat_functions
 from .deconvolution import (
     Deconvolver,
     bin_capture,
@@ -35,8 +35,8 @@ from .deconvolution import (
 )
 from .inverse_problem import cell_side, held_out_squares, sum_pixels
 
-# Planes that have numbers of their own; those of other planes are interpolated between them.
-_NODES = 3
+# Largest change of scale. Freer ones turn planes into planes at other depths, which explain a capture better, too.
+_FARTHEST = 0.05
 # Steps of the volume from nothing, and Levenberg-Marquardt steps.
 _STEPS, _FIT_STEPS = 60, 8
 # Voxels of the scene beyond which pixels are binned.
@@ -54,24 +54,24 @@ class PsfFit(NamedTuple):
     psf
         The refined stack, or the given one if the numbers do not predict held-out pixels better.
     scale
-        Magnification of each plane's PSF about its middle.
+        Magnification of the PSFs about their middles.
     blur
-        Standard deviation of the Gaussian blur of each plane, pixels.
+        Standard deviation of the Gaussian blur, pixels.
     before, after
         RMS error of the second set of held-out pixels by the given PSFs and by the fitted numbers, relative to the RMS
         of these pixels.
     """
 
     psf: Float32[np.ndarray, "depth high wide"]
-    scale: Float[np.ndarray, " depth"]
-    blur: Float[np.ndarray, " depth"]
+    scale: float
+    blur: float
     before: float
     after: float
 
     @property
     def is_better(self) -> bool:
-        """Whether the numbers predict held-out pixels better than the given PSFs do."""
-        return self.after < self.before
+        """Whether the numbers predict held-out pixels better than the given PSFs do, by a scale that is within 5 %."""
+        return self.after < self.before and abs(self.scale - 1) < _FARTHEST
 
 
 def fit_psf(
@@ -86,8 +86,7 @@ def fit_psf(
 
     *Host.*
 
-    Large captures are binned. Up to three planes have two numbers each; in deeper stacks both are linear in depth
-    between the first, the middle and the last plane.
+    Large captures are binned. All planes have the same scale and blur.
 
     Parameters
     ----------
@@ -115,12 +114,10 @@ def fit_psf(
     first, second = ((1 - kept) * (cells == parity) for parity in (0, 1))
     # An edge has 1 / side as many binned pixels, an area 1 / side^2.
     inner = dataclasses.replace(solver, steps=_STEPS, tolerance=0.0, tv=solver.tv / side)
-    nodes = min(_NODES, len(psf))
-    hats = np.asarray(hat_functions(len(psf), nodes, float), np.float32) if nodes > 1 else np.ones((1, 1), np.float32)
     # Weights, too, are arguments of the program.
-    data = jax.tree.map(jnp.asarray, _Data(light, spots, kept, first, hats, inner))
-    given = jnp.zeros((nodes, 2))
-    start = given.at[:, 1].set(_FIRST_BLUR)
+    data = jax.tree.map(jnp.asarray, _Data(light, spots, kept, first, inner))
+    given = jnp.zeros(2)
+    start = given.at[1].set(_FIRST_BLUR)
     lm = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-2)
     with (progress or Progress()).step("Refining the PSFs"):
         error = np.asarray(_error(given, data))
@@ -131,12 +128,10 @@ def fit_psf(
         )
         errors = error, np.asarray(_error(found.value, data))
     before, after = (_rms(error, second) / max(_rms(light, second), _TINY) for error in errors)
-    scale, blur = (
-        np.asarray(part, np.float64) for part in _numbers(found.value.astype(light.dtype), data.hats, spots.shape)
-    )
-    blur = side * np.abs(blur)
+    scale, blur = map(float, _numbers(found.value, spots.shape))
+    blur = side * abs(blur)
     fit = PsfFit(psf, scale, blur, before, after)
-    return fit._replace(psf=np.asarray(_warp(psf, *map(jnp.float32, (scale, blur))))) if fit.is_better else fit
+    return fit._replace(psf=np.asarray(_warp(psf, jnp.float32(scale), jnp.float32(blur)))) if fit.is_better else fit
 
 
 def _rms(image, mask):
@@ -148,25 +143,23 @@ class _Data(eqx.Module):
     spots: Float[Array | np.ndarray, "depth high wide"]
     kept: Float[Array | np.ndarray, "row column"]
     weight: Float[Array | np.ndarray, "row column"]
-    hats: Float[Array | np.ndarray, "depth node"]
     solver: ConvolutionADMM
 
 
-def _numbers(parameters, hats, shape):
-    """Scale and blur of each plane; parameters are in pixels, those of scales at the PSF's nearer edges."""
-    values = hats @ parameters
-    return 1 + values[:, 0] / (min(shape[1:]) / 2), values[:, 1]
+def _numbers(parameters, shape):
+    """Scale and blur; parameters are in pixels, that of the scale at the PSF's nearer edges."""
+    return 1 + parameters[0] / (min(shape[1:]) / 2), parameters[1]
 
 
 @jax.jit
 def _warp(spots, scale, blur):
-    return jax.lax.map(lambda plane: warp_psf(*plane), (jnp.asarray(spots), scale, blur))
+    return jax.lax.map(lambda spot: warp_psf(spot, scale, blur), jnp.asarray(spots))
 
 
 @eqx.filter_jit
 def _error(parameters, data):
     """Error of all pixels by the volume from those that are kept."""
-    spots = _warp(data.spots, *_numbers(parameters.astype(data.light.dtype), data.hats, data.spots.shape))
+    spots = _warp(data.spots, *_numbers(parameters.astype(data.light.dtype), data.spots.shape))
     A = ConvolutionOperator(spots, data.light.shape, data.kept)
     scene = solve(A, data.kept * data.light, data.solver, throw=False).value
     return eqx.tree_at(lambda a: a.kept, A, None).mv(scene) - data.light
