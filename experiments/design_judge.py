@@ -287,7 +287,8 @@ class Judge:
 
     def __init__(self, file: Path, settings: Settings, reference: gs.Imager):
         self.file, self.settings, self.reference = file, settings, device(reference, settings)
-        as_json = json.loads(json.dumps(settings._asdict() | {"images": IMAGES[settings.images]}))
+        own = {"images": IMAGES[settings.images], "reference": mark("first", self.reference)}
+        as_json = json.loads(json.dumps(settings._asdict() | own))
         self.kept = read_records(file, "settings", as_json, {"scenes": {}, "found": {}})
         records = [record for found in self.kept["found"].values() for record in found.values()]
         if settings.images == "rays" and not all("model" in record for record in records):

@@ -72,7 +72,8 @@ def run(
 ) -> list[dict[str, Any]]:
     """A row for each method, number of steps, kind, exposure and draw."""
     imager = eqx.tree_at(lambda i: i.sensor, gs.geomscope().imager(), SENSOR)
-    kept = read_records(records, "runs", [list(one) for one in RUNS], {"rows": {}})
+    settings = [*map(list, RUNS), [*GRID.volume_shape, GRID.pitch, *SENSOR.shape, RAYS, TILE, BLUR]]
+    kept = read_records(records, "settings", settings, {"rows": {}})
     methods: dict[str, Any] = {}
     for draw, kind in progress.track([(draw, kind) for draw in range(draws) for kind in kinds], "Scenes"):
         if all(f"{kind} {draw} {exposure}" in kept["rows"] for exposure in exposures):
@@ -130,6 +131,8 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
 
 
 def report(kinds: list[str], exposures: list[int], draws: int, records: Path, progress: gs.Progress) -> Report:
+    if draws < 1 or min(exposures) < 1:
+        raise gs.InputError(f"--draws and --exposures must be 1 or more, got {draws} and {exposures}.")
     make_folder(records.parent)
     rows = run(kinds, exposures, draws, records, progress)
     keys = list(dict.fromkeys((row["kind"], row["exposure"]) for row in rows))

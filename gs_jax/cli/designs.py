@@ -195,7 +195,8 @@ def optimize_command(
     from ..codesign.terms import add_terms
 
     # An interrupted run may have left its first design.
-    check_outputs(output, [".toml"], *side_files(output), inputs=(design, study, terms), force=force or resume)
+    left = resume and checkpoint_path(output, resume=True).exists()
+    check_outputs(output, [".toml"], *side_files(output), inputs=(design, study, terms), force=force or left)
     # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
     checkpoint = checkpoint_path(output, resume=resume)

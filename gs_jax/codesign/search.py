@@ -408,12 +408,17 @@ def run_study(
         warn_of_start(problem, values)
         before = problem.rows(question.terms, values)
         written = partial(_written, parent, problem)
-        waits = [] if first is None else [first]
+        # Goals are never met.
+        waits = [first] if first and not all(term.is_goal for term in question.terms) else []
 
         def each(state: State | None, met: Values | None) -> None:
             save(state)
             if waits and met is not None:
-                design, rows = written(met)
+                # A step may lead where no microscope is.
+                try:
+                    design, rows = written(met)
+                except InputError:
+                    return
                 if all(row.met is not False for row in rows):
                     waits.pop()(design)
 
