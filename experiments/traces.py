@@ -138,7 +138,8 @@ def report(design: Path | None, progress: gs.Progress) -> Report:
         "0.98 or more",
         "errors / standard errors",
     ]
-    return tables_report("traces", numbers, (columns, rows), title="Traces", **({"png": figure} if figure else {}))
+    pictures: dict[str, Any] = {"png": figure} if figure else {}
+    return tables_report("traces", numbers, (columns, rows), title="Traces", **pictures)
 
 
 def rows_of(size: float, numbers: dict[str, Any]) -> list[list[str]]:

@@ -56,8 +56,8 @@ class MethodOptions(OptionGroup):
 
     Options:
         method: Back-projection, or an iterative method.
-        steps: Steps of list-rl, richardson-lucy, fista and admm, in large volumes mostly on wider voxels, where the first
-            two take 24 and 8 at least; unrolled and surface have their own. [default: 20]
+        steps: Steps of list-rl, richardson-lucy, fista and admm, in large volumes mostly on wider voxels, where the
+            first two take 24 and 8 at least; unrolled and surface have their own. [default: 20]
         optics: Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.
         tv: Weight of total variation (richardson-lucy, admm).
         sparsity: Weight of the sum of voxels (fista, admm).
