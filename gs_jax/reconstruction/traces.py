@@ -1,7 +1,7 @@
 """Signals of regions of a recording over time: means above the background about each region, and dF/F. Host code."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
@@ -22,7 +22,7 @@ Signals = Float[np.ndarray, "frame region"]
 # Standard deviation, in voxels of a plane, by which a volume is smoothed before it is segmented, the neighbourhood
 # (z, y, x) of which a seed is the brightest voxel, and fewest voxels of a region.
 _SMOOTHING, _NEIGHBOURHOOD, _LEAST = 1.0, (3, 5, 5), 4
-_NO_REGION = "no region stands out of the volume; give --regions or --from-points"
+_NO_REGION = "no region stands out of the volume; give --segment mean, --regions or --from-points"
 # Voxels about a region that belong to neither it nor its background, fewest voxels of its background, and the largest
 # distance of these.
 _GAP, _BACKGROUND, _FARTHEST = 1, 60, 12
@@ -100,6 +100,11 @@ def regions_of_points(points: Float[np.ndarray, "point _"], grid: Grid, radius: 
     return labels
 
 
+def _boxes(labels: Labels) -> Iterator[tuple[int, tuple[slice, ...]]]:
+    """Number of each region and the box that it lies in; numbers may be large."""
+    return zip(np.unique(labels[labels > 0]), find_objects(relabel_sequential(labels)[0]), strict=True)
+
+
 class RegionSignals:
     """Mean of each region, and of the background about it, in volumes that are given one by one.
 
@@ -120,8 +125,7 @@ class RegionSignals:
         free = ~np.asarray(binary_dilation(labels > 0, np.ones((1, 3, 3), bool), _GAP), bool)
         if not free.any():
             raise InputError("regions must leave voxels for the background, got regions that fill the volume.")
-        boxes = find_objects(labels)
-        self._around = [self._background(labels, number, boxes[number - 1], free) for number in self.numbers]
+        self._around = [self._background(labels, number, box, free) for number, box in _boxes(labels)]
 
     @staticmethod
     def _background(labels: Labels, number: int, box, free: Bool[np.ndarray, "depth y x"]):
@@ -176,9 +180,8 @@ def emitters_of_regions(
 
     A region that is nowhere above its background shines evenly.
     """
-    emitters, boxes = [], find_objects(labels)
-    for number, background in zip(np.unique(labels[labels > 0]), backgrounds, strict=True):
-        box = boxes[number - 1]
+    emitters = []
+    for (number, box), background in zip(_boxes(labels), backgrounds, strict=True):
         voxels = np.argwhere(labels[box] == number) + [side.start for side in box]
         light = np.maximum(mean[tuple(voxels.T)].astype(np.float64) - background, 0)
         light = light if light.any() else np.ones(len(voxels))
