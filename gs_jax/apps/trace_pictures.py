@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from ..io.traces import SIGNALS
 from ..microscope.grid import Grid
 
 # Colours of neighbours in number differ: steps of the golden ratio through a map.
@@ -63,10 +64,11 @@ def draw_traces(
     """
     numbers, row = np.unique(columns["region"], return_inverse=True)
     frames, column = np.unique(columns["frame"], return_inverse=True)
-    names = ("demixed", "intensity", "mean")
-    name = "dff" if np.isfinite(columns["dff"]).any() else next(name for name in names if name in columns)
-    values = np.full((len(numbers), len(frames)), np.nan)
-    values[row, column] = columns[name]
+    name = "dff" if np.isfinite(columns["dff"]).any() else next(name for name in SIGNALS if name in columns)
+    # Columns from edge to edge; those between the edges of frames are gaps.
+    edges = np.union1d(frames - 0.5, frames + 0.5)
+    values = np.full((len(numbers), len(edges) - 1), np.nan)
+    values[row, np.searchsorted(edges, frames - 0.5)[column]] = columns[name]
     places = np.array([[np.median(columns[axis][row == n]) for axis in ("x_mm", "y_mm")] for n in range(len(numbers))])
     figure = Figure(figsize=(12, 5), dpi=110, layout="constrained")
     above, heat = figure.subplots(1, 2, width_ratios=(1, 1.4))
@@ -76,7 +78,9 @@ def draw_traces(
         if labels is not None:
             x, y = np.asarray(grid.x), np.asarray(grid.y)
             for number, colour in zip(numbers, _colours(numbers), strict=True):
-                above.contour(x, y, labels == number, [0.5], colors=[colour], linewidths=1)
+                # Another region may hide it.
+                if 0 < np.count_nonzero(inside := labels == number) < inside.size:
+                    above.contour(x, y, inside, [0.5], colors=[colour], linewidths=1)
     else:
         above.scatter(*places.T, c=_colours(numbers), s=25)
         above.set(aspect="equal")
@@ -89,13 +93,13 @@ def draw_traces(
     above.set(xlabel="x, mm", ylabel="y, mm", title=f"{count}, from above")
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
-    time = columns["time_s"] if "time_s" in columns else columns["frame"]
-    step = (time.max() - time.min()) / max(len(frames) - 1, 1) if len(time) else 0
-    ends = (time.min() - (step or 1) / 2, time.max() + (step or 1) / 2) if len(time) else (0, 1)
-    picture = heat.imshow(
-        values, "viridis", vmin=low, vmax=high, aspect="auto", extent=(*ends, len(numbers), 0), interpolation="nearest"
-    )
-    heat.set(xlabel="time, s" if "time_s" in columns else "frame", ylabel="region", title="Signals over time")
+    if timed := "time_s" in columns:
+        ends = np.argmin(columns["frame"]), np.argmax(columns["frame"])
+        step = np.ptp(columns["time_s"][[*ends]]) / (np.ptp(frames) or 1) or 1.0
+        edges = columns["time_s"][ends[0]] + step * (edges - frames[0])
+    rows = np.arange(len(numbers) + 1)
+    picture = heat.pcolorfast(edges, rows, values, cmap="viridis", vmin=low, vmax=high)
+    heat.set(xlabel="time, s" if timed else "frame", ylabel="region", title="Signals over time", ylim=(rows[-1], 0))
     ticks = np.arange(0, len(numbers), -(-len(numbers) // _TICKS) or 1)
     heat.set_yticks(ticks + 0.5, [str(numbers[tick]) for tick in ticks])
     figure.colorbar(picture, ax=heat, label="dF/F" if name == "dff" else name)

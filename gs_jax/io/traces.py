@@ -20,6 +20,8 @@ from .recordings import zarr_image
 TRACE_SUFFIXES = (".csv", ".h5")
 # Columns that every table of traces has.
 _NEEDED = ("region", "frame", "x_mm", "y_mm", "z_mm", "dff")
+# F, of which a table has one or more.
+SIGNALS = ("demixed", "intensity", "mean")
 
 Columns = Mapping[str, Shaped[np.ndarray, " row"]]
 
@@ -56,6 +58,10 @@ def read_traces(path: PathLike) -> dict[str, np.ndarray]:
             columns = {name: rows[name] for name in rows.dtype.names or ()}
     if missing := [name for name in _NEEDED if name not in columns]:
         raise InputError(f"{path}: must be a table of `gs-jax traces`, got no column {missing[0]}.")
+    if len({values.shape for values in columns.values()}) > 1 or columns["dff"].ndim != 1 or not len(columns["dff"]):
+        raise InputError(f"{path}: must be a table of `gs-jax traces`, with rows, and columns of one length.")
+    if not np.isfinite(columns["dff"]).any() and not any(name in columns for name in SIGNALS):
+        raise InputError(f"{path}: must be a table of `gs-jax traces`, got no signal: dff is nan in all rows.")
     return {name: values.astype(int) if name in _NEEDED[:2] else values for name, values in columns.items()}
 
 
