@@ -4,6 +4,7 @@ No volume is needed: a capture is explained by one image for each region, its li
 that is smooth over the sensor, of any sign. Pixels are weighted by their variance.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
@@ -33,6 +34,7 @@ Emitters = Float[np.ndarray, "emitter 4"]
 class RegionImages(NamedTuple):
     """Images of regions, each of the light 1, in the `pixels` of a sensor that are used: their flat indices."""
 
+    numbers: Int[np.ndarray, " region"]
     shape: tuple[int, int]
     pixels: Int[np.ndarray, " pixel"]
     images: Float32[np.ndarray, "region pixel"]
@@ -62,7 +64,13 @@ class Demixed(NamedTuple):
     error: Float64[np.ndarray, " region"]
 
 
-def image_regions(regions: Sequence[Emitters], imager: Imager, *, progress: Progress | None = None) -> RegionImages:
+def image_regions(
+    regions: Sequence[Emitters],
+    imager: Imager,
+    *,
+    numbers: Int[np.ndarray, " region"] | None = None,
+    progress: Progress | None = None,
+) -> RegionImages:
     """Image each region through the full model.
 
     Parameters
@@ -71,6 +79,8 @@ def image_regions(regions: Sequence[Emitters], imager: Imager, *, progress: Prog
         Emitters `(x, y, z, intensity)` of each, mm; a point is a region of one.
     imager
         The microscope, with the pixels of the captures.
+    numbers
+        Of the regions, for messages. None: from 1.
     progress
         Shows how many are imaged.
 
@@ -88,11 +98,12 @@ def image_regions(regions: Sequence[Emitters], imager: Imager, *, progress: Prog
     if total is not None and count < total.size:
         pixels = np.sort(np.argpartition(-total.ravel(), count)[:count])
     images = np.empty((len(regions), len(pixels)), np.float32)
-    for number, region in enumerate(progress.track(regions, "Imaging regions")):
-        images[number] = image_of(region).ravel()[pixels]
-        if not images[number].max() > _TINY:
-            raise InputError(f"region {number + 1} must cast light on the sensor, got none.")
-    return RegionImages(imager.sensor.shape, pixels, images)
+    numbers = np.arange(1, len(regions) + 1) if numbers is None else numbers
+    for row, region in enumerate(progress.track(regions, "Imaging regions")):
+        images[row] = image_of(region).ravel()[pixels]
+        if not images[row].max() > _TINY:
+            raise InputError(f"region {numbers[row]} must cast light on the sensor, got none.")
+    return RegionImages(numbers, imager.sensor.shape, pixels, images)
 
 
 def _imager_of(points: Emitters, imager: Imager, progress: Progress) -> Callable[[Emitters], np.ndarray]:
@@ -116,21 +127,20 @@ def prepare_demixing(regions: RegionImages, captures: Iterable[Image]) -> Demixi
 
     The variance is taken as a constant and a multiple of the light, fitted to what a fit with equal weights leaves.
 
-    Raises `InputError` if two regions cast the same image.
+    Raises `InputError` if regions cast images that cannot be told apart.
     """
     columns = np.concatenate([regions.images, _modes(regions)])
     parts = [np.asarray(capture, np.float32).ravel()[regions.pixels] for capture in captures]
     mean = np.asarray(np.mean(parts, axis=0, dtype=np.float64))
-    count = len(regions.images)
-    _check_distinct(regions.images)
-    equal = _normal_equations(regions.pixels, columns, np.ones(len(mean), np.float32), count)
+    _check_distinct(regions)
+    equal = _normal_equations(regions, columns, np.ones(len(mean), np.float32))
     explained, background = _explain(equal, np.asarray(mean, np.float32))
     left, light = mean - explained - background, np.maximum(explained, 0)
     (constant, share), _ = nnls(np.column_stack([np.ones(len(left)), light]), left**2)
     variance = constant + share * light
     variance = np.maximum(variance, max(1e-6 * float(variance.max()), _TINY))
     weights = (variance.mean() / variance).astype(np.float32)
-    return _normal_equations(regions.pixels, columns, weights, count)
+    return _normal_equations(regions, columns, weights)
 
 
 def _modes(regions: RegionImages) -> Float32[np.ndarray, "mode pixel"]:
@@ -141,25 +151,34 @@ def _modes(regions: RegionImages) -> Float32[np.ndarray, "mode pixel"]:
     return (waves[0][:, None] * waves[1][None]).reshape(_MODES**2, -1).astype(np.float32)
 
 
-def _check_distinct(images: Float32[np.ndarray, "region pixel"]) -> None:
-    normed = images / np.linalg.norm(images, axis=1, keepdims=True)
+def _check_distinct(regions: RegionImages, least: float = _LEAST) -> None:
+    normed = regions.images / np.linalg.norm(regions.images, axis=1, keepdims=True)
     alike = (normed @ normed.T).astype(np.float64)
-    if np.linalg.eigvalsh(alike)[0] < _LEAST:
-        first, second = sorted(np.unravel_index(np.argmax(alike - 2 * np.eye(len(alike))), alike.shape))
-        raise InputError(f"regions must cast different images, got {first + 1} and {second + 1} alike: leave one out.")
+    if np.linalg.eigvalsh(alike)[0] < least:
+        pair = np.unravel_index(np.argmax(alike - 2 * np.eye(len(alike))), alike.shape)
+        first, second = sorted(regions.numbers[list(pair)])
+        raise InputError(f"regions must cast different images, got {first} and {second} alike: leave one out.")
 
 
-def _normal_equations(pixels, columns, weights, count: int) -> Demixing:
-    gram = np.empty((len(columns), len(columns)))
+def _normal_equations(regions: RegionImages, columns, weights) -> Demixing:
+    count, gram = len(regions.images), np.empty((len(columns), len(columns)))
     for number, column in enumerate(columns):
         gram[number] = columns @ (weights * column)
-    regions, modes = gram[:count, :count], gram[count:, count:]
+    own, modes = gram[:count, :count], gram[count:, count:]
     across = gram[:count, count:]
-    schur = regions - across @ np.linalg.solve(modes, across.T)
-    factor = np.linalg.cholesky((schur + schur.T) / 2)
-    sums = np.linalg.inv(gram)[:count].astype(np.float32) @ columns
+    try:
+        schur = own - across @ np.linalg.solve(modes, across.T)
+        factor = np.linalg.cholesky((schur + schur.T) / 2)
+        sums = np.linalg.inv(gram)[:count].astype(np.float32) @ columns
+    except np.linalg.LinAlgError:
+        # Alike beside the background, or in the few pixels that have weight.
+        if count > 1:
+            _check_distinct(regions, math.inf)
+        raise InputError(
+            f"region {regions.numbers[0]} must cast an image unlike the background, which is smooth."
+        ) from None
     sums *= weights
-    return Demixing(pixels, columns, weights, gram, factor, np.square(sums, out=sums))
+    return Demixing(regions.pixels, columns, weights, gram, factor, np.square(sums, out=sums))
 
 
 def _explain(system: Demixing, values: Float32[np.ndarray, " pixel"]):
