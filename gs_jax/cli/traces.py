@@ -37,8 +37,8 @@ def _radius(text: str) -> tuple[float, float]:
 class _Recording:
     """Regions of a recording, and their signals `(frame, region)` by name.
 
-    `places` are `(1 or frame, region, 3)`, mm, `emitters` of each region its points. `labels`, `image` and `grid` are
-    those of volumes.
+    `places` are `(1 or frame, region, 3)`, mm, `emitters` of each region its points, and `spread` how far its place
+    moves along x or y, mm. `labels`, `image` and `grid` are those of volumes.
     """
 
     numbers: Any
@@ -46,6 +46,7 @@ class _Recording:
     places: Any
     signals: dict[str, Any]
     emitters: list[Any]
+    spread: Any = 0.0
     count: int | None = None
     interval: float | None = None
     grid: Any = None
@@ -122,13 +123,11 @@ def traces_command(
         raise InputError(f"{given[0]} must be used with VOLUME.zarr, got {source}.")
     picture, beside = side_file(output, ".png"), side_file(output, ".labels.tif")
     own_labels = [beside] if not (is_table or regions or from_points) else []
-    inputs = (source, regions, from_points, demix, design)
+    inputs = (source, regions, from_points, demix, design, *camera.files)
     check_output(output, TRACE_SUFFIXES)
     if output.suffix.lower() == ".h5":
         import_h5py()
-    check_outputs(
-        output, TRACE_SUFFIXES, picture, *own_labels, inputs=[*filter(None, inputs), *camera.files], force=force
-    )
+    check_outputs(output, TRACE_SUFFIXES, picture, *own_labels, inputs=[*filter(None, inputs)], force=force)
     if own_labels and beside.exists() and not force:
         # It may have been corrected by hand.
         raise InputError(f"{beside}: the output must be a new file, got an existing one; --force replaces it.")
@@ -138,8 +137,10 @@ def traces_command(
         else:
             found = _of_volumes(source, regions, from_points, radius_um, segment or _SUMMARIES[0], progress)
         signal = found.signals["intensity"] if is_table and not demix else None
+        microscope = None
         if demix and design:
-            imager = camera.imager(light.imager(read_design(design)))
+            microscope = read_design(design)
+            imager = camera.imager(light.of_channel(microscope, camera.channel).imager(microscope))
             signal = _demix(found, demix, imager, camera, progress)
         elif not is_table:
             signal = found.signals["mean"] - found.signals["background"]
@@ -147,7 +148,7 @@ def traces_command(
         found.signals["dff"] = relative_change(np.asarray(signal), share, window)
         table = traces_table(found.numbers, found.frames, found.places, found.signals, found.interval)
         used = f"{share:g} % of {'all frames' if window is None else f'{window} frames about each'}"
-        provenance = camera.recorded(provenance_of(*inputs)) | {"baseline": f"percentile {used}"}
+        provenance = camera.recorded(provenance_of(*inputs, design=microscope)) | {"baseline": f"percentile {used}"}
         with progress.step("Writing"):
             write_traces(output, table, provenance)
             labels = found.labels
@@ -237,7 +238,8 @@ def _of_points(source: Path, *, demixed: bool) -> _Recording:
     middle = np.array([np.median(points[region == number], axis=0) for number in range(len(numbers))])
     emitters = [np.array([[*place[:3], 1.0]]) for place in middle]
     if demixed:
-        return _Recording(numbers, frames, middle[None, :, :3], {}, emitters)
+        spread = np.array([np.ptp(points[region == number, :2], axis=0).max() for number in range(len(numbers))])
+        return _Recording(numbers, frames, middle[None, :, :3], {}, emitters, spread)
     return _Recording(numbers, frames, places[..., :3], {"intensity": places[..., 3]}, emitters)
 
 
@@ -248,7 +250,11 @@ def _demix(found: _Recording, captures: Path, imager, camera: CaptureOptions, pr
     from ..io.recordings import open_recording
     from ..reconstruction.demixing import demix, image_regions, prepare_demixing
 
-    with open_recording(captures, page=camera.page) as recording:
+    pixel = imager.sensor.pixel_pitch / np.asarray(imager.magnification(found.places[0, :, 2]))
+    if moving := int(np.sum(found.spread > pixel)):
+        text = f"{moving} of {plural(len(found.numbers), 'particle')} move by more than a pixel"
+        camera.warnings[f"{text}, and all frames are demixed with their median places"] = None
+    with open_recording(captures, page=camera.page, channel=camera.channel) as recording:
         if recording is None:
             raise InputError(f"--demix must be a recording, got a single capture {captures}.")
         count = len(recording.names)
@@ -257,10 +263,16 @@ def _demix(found: _Recording, captures: Path, imager, camera: CaptureOptions, pr
         if found.count is None:
             found.frames = np.arange(count)
         read = camera.frames(recording)
-        images = image_regions(found.emitters, imager, progress=progress)
+        images = image_regions(found.emitters, imager, numbers=found.numbers, progress=progress)
         some = found.frames[np.linspace(0, len(found.frames) - 1, min(_REFERENCES, len(found.frames))).astype(int)]
         system = prepare_demixing(images, (read(int(frame))[0] for frame in some))
-        rows = [demix(read(int(frame))[0], system) for frame in progress.track(found.frames, "Demixing")]
+        rows, warned = [], []
+        for frame in progress.track(found.frames, "Demixing"):
+            image, _, warnings = read(int(frame))
+            rows.append(demix(image, system))
+            warned += warnings[:1]
+    if warned:
+        camera.warnings[f"in {plural(len(warned), 'frame')}, the first: {warned[0]}"] = None
     found.signals["demixed"], found.signals["demixed_se"] = (np.array(part) for part in zip(*rows, strict=True))
     found.lines.append(f"demixed in {len(system.pixels)} of {np.prod(imager.sensor.shape)} pixels")
     return found.signals["demixed"]
