@@ -9,6 +9,7 @@ import zarr
 
 import gs_jax as gs
 from experiments import traces as experiment
+from gs_jax.apps.trace_pictures import draw_traces
 from gs_jax.base.errors import InputError
 from gs_jax.io.ngff import VolumeSeries, read_series, series_grid
 from gs_jax.io.traces import read_labels, read_traces, write_traces
@@ -97,13 +98,14 @@ def test_regions_of_points_by_distance():
 def test_means_above_a_background_that_is_not_flat():
     """Each region on a pedestal of its own; its background is that of its planes, without the other regions."""
     labels = np.zeros(GRID.volume_shape, np.int32)
-    labels[1, 8:13, 9:15], labels[1, 8:13, 17:21], labels[2, 28:33, 34:39] = 7, 3, 12
+    most = np.iinfo(np.int32).max
+    labels[1, 8:13, 9:15], labels[1, 8:13, 17:21], labels[2, 28:33, 34:39] = 7, 3, most
     volume = np.zeros(GRID.volume_shape, np.float32) + np.array([1.0, 2, 5], np.float32)[:, None, None]
-    for number, value in ((7, 3.0), (3, 30.0), (12, 4.0)):
+    for number, value in ((7, 3.0), (3, 30.0), (most, 4.0)):
         volume[labels == number] += value
     signals = RegionSignals(labels)
     means, backgrounds = signals(volume)
-    assert signals.numbers.tolist() == [3, 7, 12] and signals.sizes.tolist() == [20, 30, 25]
+    assert signals.numbers.tolist() == [3, 7, most] and signals.sizes.tolist() == [20, 30, 25]
     np.testing.assert_allclose(backgrounds, [2, 2, 5])
     np.testing.assert_allclose(means - backgrounds, [30, 3, 4])
     emitters = emitters_of_regions(labels, volume, backgrounds, GRID)
@@ -111,6 +113,21 @@ def test_means_above_a_background_that_is_not_flat():
     np.testing.assert_allclose(emitters[2][0, :3], GRID.to_mm(np.array([2, 28, 34])), rtol=1e-6)
     with pytest.raises(InputError, match="regions that fill the volume"):
         RegionSignals(np.ones(GRID.volume_shape, np.int32))
+
+
+def test_pictures_have_gaps_and_hidden_regions():
+    columns = {"region": [1, 2] * 3, "frame": [2, 2, 3, 3, 6, 6], "dff": np.arange(6.0)}
+    columns |= dict.fromkeys(("x_mm", "y_mm"), np.zeros(6))
+    columns = {name: np.asarray(values) for name, values in columns.items()} | {"time_s": np.repeat([1, 1.5, 3], 2)}
+    image = np.zeros(GRID.shape, np.float32)
+    labels = np.zeros(GRID.shape, np.int32)
+    labels[3:6, 3:6] = 2
+    heat = draw_traces(columns, image, labels, GRID).axes[1]
+    (picture,) = heat.images
+    values = np.asarray(picture.get_array())
+    np.testing.assert_array_equal(values, [[0, 2, np.nan, 4], [1, 3, np.nan, 5]])
+    np.testing.assert_allclose(heat.get_xlim(), (0.75, 3.25))
+    np.testing.assert_allclose(heat.get_ylim(), (2, 0))
 
 
 def test_relative_change():
@@ -145,6 +162,11 @@ def test_other_tables_are_refused(folder):
     (folder / "t.csv").write_text("x_mm,y_mm\n1,2\n")
     with pytest.raises(InputError, match="t.csv: must be a table of `gs-jax traces`, got no column region"):
         read_traces("t.csv")
+    header = "region,frame,x_mm,y_mm,z_mm,dff\n"
+    for rows, message in (("", "with rows"), ("1,0,0,0,20,nan\n", "got no signal")):
+        (folder / "t.csv").write_text(header + rows)
+        with pytest.raises(InputError, match=f"t.csv: must be a table of `gs-jax traces`, {message}"):
+            read_traces("t.csv")
     (folder / "t.csv").write_text("x_mm,y_mm\n1,2,3\n1\n")
     with pytest.raises(InputError, match="t.csv: not a whole and valid table of traces"):
         read_traces("t.csv")
@@ -208,16 +230,29 @@ def test_demixed_light_is_right_within_its_error(images):
 
 
 def test_pixels_and_regions_that_cannot_be_used(images, monkeypatch):
-    with pytest.raises(InputError, match="regions must cast different images, got 1 and 3 alike"):
-        prepare_demixing(images._replace(images=images.images[[0, 1, 0]]), frames_of(images))
+    def fail(_):
+        raise np.linalg.LinAlgError("not positive definite")
+
+    same = images._replace(images=images.images[[0, 1, 0]], numbers=np.array([7, 0, 4]))
+    with pytest.raises(InputError, match="regions must cast different images, got 4 and 7 alike"):
+        prepare_demixing(same, frames_of(images))
+    # Alike beside the background alone: it is up to rounding whether the factorisation fails.
+    with monkeypatch.context() as patch:
+        patch.setattr("numpy.linalg.cholesky", fail)
+        patch.setattr("gs_jax.reconstruction.demixing._LEAST", -1.0)
+        with pytest.raises(InputError, match="regions must cast different images, got 4 and 7 alike"):
+            prepare_demixing(same, frames_of(images))
+        one = images._replace(images=images.images[:1], numbers=np.array([5]))
+        with pytest.raises(InputError, match="region 5 must cast an image unlike the background"):
+            prepare_demixing(one, frames_of(images))
     # The brightest pixels alone, where there are many.
     monkeypatch.setattr("gs_jax.reconstruction.demixing._MOST", 3 * 1500)
     few = image_regions([bead[None] for bead in BEADS], SCOPE)
     assert few.images.shape == (3, 1500)
     np.testing.assert_allclose(few.images, images.images[:, few.pixels], rtol=1e-5, atol=1e-9)
     assert few.images.sum() > images.images.sum() * 1500 / images.images.shape[1]
-    with pytest.raises(InputError, match="region 2 must cast light on the sensor"):
-        image_regions([BEADS[:1], BEADS[:1] * [1, 1, 1, 0]], SCOPE)
+    with pytest.raises(InputError, match="region 9 must cast light on the sensor"):
+        image_regions([BEADS[:1], BEADS[:1] * [1, 1, 1, 0]], SCOPE, numbers=np.array([3, 9]))
 
 
 def test_traces_of_volumes(recording, run):
@@ -263,6 +298,41 @@ def test_traces_of_captures(folder, run, images):
     np.testing.assert_allclose(table["demixed"].reshape(4, 3), TRUTH, atol=0.12 * TRUTH.max())
     status, _, err = run("report", "design.toml", "--traces", "t.csv", "-o", "r.html")
     assert (status, err) == (0, "") and "3 regions in 4 frames." in (folder / "r.html").read_text()
+
+
+def test_captures_of_a_channel_with_saturated_pixels_and_moving_particles(folder, run, images, monkeypatch):
+    """The channel's light, a warning about frames and one about particles; the provenance has all files."""
+    (folder / "green.toml").write_text(f"{DESIGN}\n[channels.GFP]\nwavelength_nm = 450.0\n")
+    frames = np.clip(frames_of(images), 0, 4095).astype(np.uint16)
+    frames[1:, :8, :8] = 65535
+    stack = np.stack([np.zeros_like(frames), frames], axis=1)
+    tifffile.imwrite("f.ome.tif", stack, metadata={"axes": "TCYX", "Channel": {"Name": ["DAPI", "GFP"]}}, ome=True)
+    np.save("dark.npy", np.zeros((96, 80), np.float32))
+    rows = [
+        f"{x + 0.08 * t * (k == 1)},{y},{z},1,{t},{k + 4}" for t in range(4) for k, (x, y, z, _) in enumerate(BEADS)
+    ]
+    (folder / "p.csv").write_text("\n".join(["x_mm,y_mm,z_mm,intensity,frame,particle", *rows, ""]))
+    seen = []
+    monkeypatch.setattr(
+        "gs_jax.reconstruction.demixing.image_regions",
+        lambda regions, imager, *, numbers, progress: seen.append(imager) or images._replace(numbers=numbers),
+    )
+    words = ("p.csv", "--demix", "f.ome.tif", "--design", "green.toml", "--channel", "GFP", "--dark", "dark.npy")
+    status, _, err = run("traces", *words, "-o", "t.csv")
+    assert status == 0 and "in 3 frames, the first: f.ome.tif" in err and "saturated" in err, err
+    assert "1 of 3 particles move by more than a pixel" in err and err.count("warning") == 2
+    assert float(seen[0].wavelength) == pytest.approx(450e-6) and read_traces("t.csv")["demixed"].max() > 1e7
+    _, out, _ = run("info", "t.csv")
+    assert "input dark.npy" in out and "green.toml" in out
+
+
+def test_traces_of_one_frame(folder, run):
+    """It has no deviation, and the message says what to do."""
+    VolumeSeries(folder / "v.zarr", 1, GRID).write(0, blobs(LIGHT[0]))
+    status, _, err = run("traces", "v.zarr", "-o", "t.csv")
+    assert status == 2 and "give --segment mean, --regions or --from-points" in err
+    status, out, err = run("traces", "v.zarr", "-o", "t.csv", "--segment", "mean")
+    assert (status, err) == (0, "") and "3 regions in 1 frame" in out
 
 
 @pytest.mark.parametrize(
