@@ -113,6 +113,9 @@ FILTER = {"object": [{"name": "filter", "thickness_mm": 2.0, "refractive_index":
         ({"layers": FILTER}, BOLTED, "`layers.object` must begin with 1 mm of air or more"),
         ({}, dataclasses.replace(BOLTED, bolts=30.0), "--bolts-mm must be"),
         ({}, dataclasses.replace(BOLTED, target=3.0), "--target-mm must be"),
+        # Here the front of the array is far above the collar, which the target must clear.
+        ({}, HolderShape(flange=1.5, bore=20.0, target=0.5), "--target-mm must be 1 or more, beyond the holder"),
+        ({}, HolderShape(clearance=0.4), "--clearance-mm must be below 0.4, the depth of the C-mount thread"),
         ({}, dataclasses.replace(BOLTED, pinhole=1.0), "--pinhole-um must be at most"),
         ({"working_distance_mm": (5.0, 30.0)}, HolderShape(), "must begin beyond the holder"),
         ({}, HolderShape(flange=40.0), "`imaging.working_distance_mm` must begin beyond the holder"),

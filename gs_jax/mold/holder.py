@@ -216,6 +216,9 @@ class Holder:
             )
             remedy = "for a wider one give --bore-mm and --bolts-mm of another camera"
             yield f"{text} in the camera's opening, got {2 * self.well:.4g} mm; {remedy}."
+        if shape.bore is None and shape.clearance >= (most := 2 * _ECCENTRICITY):
+            got = f"got {shape.clearance:g}"
+            yield f"--clearance-mm must be below {most:g}, the depth of the C-mount thread, without --bore-mm, {got}."
         if shape.bolts is not None and shape.bolts < (least := 2 * max(self.cap, self._mouth) + _HEAD):
             yield f"--bolts-mm must be {least:.4g} or more, beside the target and the opening, got {shape.bolts:g}."
         edge = sum(layer.thickness_mm for layer in design.layers.sensor)
@@ -232,9 +235,11 @@ class Holder:
         if (reach := self.top - self.front) >= near:
             remedy = "a camera whose face is nearer to its sensor has room (--flange-mm)"
             yield f"`imaging.working_distance_mm` must begin beyond the holder, {reach:.4g} mm, got {near:g}; {remedy}."
-        if self.depth - (begin := float(self.imager.sample_surface)) < MIN_THICKNESS_MM or self.reach < _COLLAR:
-            least = max(begin + MIN_THICKNESS_MM, self.depth - self.reach + _COLLAR)
-            yield f"--target-mm must be {least:.4g} or more, beyond the collar and the filters, got {self.depth:g}."
+        if self.depth - (begin := float(self.imager.sample_surface)) < MIN_THICKNESS_MM or self.depth < reach - 1e-6:
+            # The target is at whole layers from the flange.
+            above = math.ceil((self.top - _FLANGE) / _LAYER - 1e-6) * _LAYER + _FLANGE - self.front
+            least = max(begin + MIN_THICKNESS_MM, above)
+            yield f"--target-mm must be {least:.4g} or more, beyond the holder and the filters, got {self.depth:g}."
         if shape.pinhole > (most := min(self.spread / 2, 1.0)):
             got = f"got {1000 * shape.pinhole:g} for pinholes {self.spread:g} mm apart"
             yield f"--pinhole-um must be at most {1000 * most:.4g}, {got}."
