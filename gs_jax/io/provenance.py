@@ -26,7 +26,7 @@ from ..base.typing import PathLike
 from ..microscope.grid import Grid
 from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, side_file, write_json
 from .names import plain_text
-from .remote import remote_url
+from .remote import remote_url, without_queries
 
 Provenance = Mapping[str, str]
 
@@ -42,13 +42,13 @@ INTENSITY = {"intensity": "all light that the point emits, in counts of the capt
 
 def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> dict[str, str]:
     """Provenance of what `command` makes of input files, with their SHA-256, and of the text of a design."""
-    table = {"software": f"gs_jax {__version__}", "command": plain_text(command)}
+    table = {"software": f"gs_jax {__version__}", "command": plain_text(without_queries(command))}
     for path in map(Path, inputs):
         if path.is_file():
             with path.open("rb") as file:
                 table[input_key(path)] = f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()}"
         else:
-            table[input_key(path)] = remote_url(path) or "a folder"
+            table[input_key(path)] = without_queries(remote_url(path) or "a folder")
     return table | ({"design": design} if design else {})
 
 
@@ -59,7 +59,8 @@ def annotation(provenance: Provenance | None) -> dict[str, Any]:
 
 def input_key(path: Path) -> str:
     """The key under which provenance has an input file."""
-    return f"input {plain_text(path.name)}"
+    name = Path(without_queries(remote_url(path) or "")).name or path.name
+    return f"input {plain_text(name)}"
 
 
 def sidecar(path: PathLike) -> Path:

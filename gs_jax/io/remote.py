@@ -18,6 +18,11 @@ def remote_url(path: PathLike) -> str | None:
     return f"{match[1]}://{match[2]}" if match else None
 
 
+def without_queries(text: str) -> str:
+    """A text whose addresses end before their queries, which may hold a signature."""
+    return re.sub(r"""((?:s3|https?):/+[^\s?'"]*)\?[^\s'"]*""", r"\1", text)
+
+
 def import_zarr() -> Any:
     """The package zarr, which TIFF does not need; `InputError` if it is not installed."""
     with needs_extra("zarr"):
