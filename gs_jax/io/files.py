@@ -18,7 +18,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
-from ..base.errors import InputError, input_error, short_repr
+from ..base.errors import InputError, MissingExtraError, input_error, short_repr
+from .remote import remote_url
 
 # Not from `gs_jax.base.typing`, which imports JAX: the help of commands does without.
 PathLike = str | os.PathLike[str]
@@ -261,10 +262,12 @@ def decoding(path: PathLike, kind: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except MemoryError:
+    except (MemoryError, MissingExtraError):
         raise
     except Exception as error:
-        raise InputError(f"{path}: not a whole and valid {kind}: {_reason(error).rstrip('.!'):.200}.") from error
+        # At an address it may be the network.
+        fault = "cannot be read" if remote_url(path) else f"not a whole and valid {kind}"
+        raise InputError(f"{path}: {fault}: {_reason(error).rstrip('.!'):.200}.") from error
     finally:
         logger.disabled = was_disabled
 
