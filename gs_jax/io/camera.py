@@ -18,6 +18,7 @@ from .captures import (
     GreyError,
     Selection,
     average,
+    is_grey,
     mosaic_channel,
     mosaic_sites,
     read_images,
@@ -202,7 +203,8 @@ def read_corrected(
     shape = readout.region(sensor).shape if sensor else None
     images = read_images(path, Selection(shape, page, readout.channel, readout.bayer))
     image, done, warnings = _average(path, images, readout)
-    return _apply(prepare(image.shape, shape, readout, correction), image, done, warnings)
+    grey = is_grey(Path(path), page, readout.channel)
+    return _apply(prepare(image.shape, shape, readout, correction, grey), image, done, warnings)
 
 
 def read_frame(
@@ -217,6 +219,7 @@ def prepare(
     shape: tuple[int, int] | None = None,
     readout: Readout = Readout(),
     correction: Correction = Correction(),
+    grey: bool = False,
 ) -> Prepared:
     """Read the files of a correction.
 
@@ -228,6 +231,8 @@ def prepare(
         Shape of the captures in their files, if it is known.
     readout, correction
         As for `read_corrected`, with the same errors.
+    grey
+        Whether the images that are corrected are grey, whatever their channel is called.
     """
     if correction.dark and correction.offset:
         raise InputError(f"--offset must not be given with --dark, got {correction.dark}; its offset is the dark's.")
@@ -235,16 +240,16 @@ def prepare(
     done, warnings = readout.describe(), []
     dark, gain = correction.offset or None, None
 
-    def read_like_capture(path: Path) -> np.ndarray:
-        selection = Selection(shape, REPEATS, readout.channel, readout.bayer)
+    def read_like_capture(path: Path, page: str | None = REPEATS, dtypes: tuple[str, ...] = DTYPES) -> np.ndarray:
+        selection = Selection(shape, page, readout.channel, readout.bayer, dtypes)
         try:
             image, _, more = _average(path, read_images(path, selection), readout)
         except GreyError:
             # A file of one channel corrects all.
-            if readout.channel in CHANNELS:
+            if readout.channel in CHANNELS and not grey:
                 raise
             image, _, more = _average(path, read_images(path, selection._replace(channel=None)), readout)
-        warnings.extend(more)
+        warnings.extend(more if dtypes == DTYPES else ())
         return _checked_size(path, image, size)
 
     def mark(pixels: np.ndarray, where: str) -> None:
@@ -265,7 +270,11 @@ def prepare(
         mark(unlit, f"unlit in {correction.flat.name}")
         done.append(f"flat field {correction.flat.name} divided out, {gain.min():.3g} to {gain.max():.3g}")
     if isinstance(correction.bad_pixels, Path):
-        mark(_read_mask(correction.bad_pixels, size, shape, readout), f"in {correction.bad_pixels.name}")
+        mask = read_like_capture(correction.bad_pixels, None, _MASK_DTYPES) != 0
+        if mask.mean() > 0.5:  # a mask that marks good pixels
+            got = f"{mask.mean():.0%}"
+            raise input_error("bad pixels", "at most half of all, with 0 for good ones", got, correction.bad_pixels)
+        mark(mask, f"in {correction.bad_pixels.name}")
     automatic = correction.bad_pixels == "auto" and not (correction.dark or readout.bayer)
     return Prepared(dark, gain, bad, bad_counts, automatic and readout.binning <= _MAX_SHARP_BINNING, done, warnings)
 
@@ -337,15 +346,6 @@ def _checked_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> np.nd
     if image.shape != size:
         raise input_error("image", f"{size_text(size)} pixels, as the capture", size_text(image.shape), path)
     return image
-
-
-def _read_mask(path: Path, size, shape, readout: Readout) -> Bool[np.ndarray, "row column"]:
-    image = average(read_images(path, Selection(shape, None, readout.channel, readout.bayer, _MASK_DTYPES)))
-    image = mosaic_channel(image, readout.bayer, readout.channel) if readout.bayer else image
-    bad = _checked_size(path, image, size) != 0
-    if bad.mean() > 0.5:  # a mask that marks good pixels
-        raise input_error("bad pixels", "at most half of all, with 0 for good ones", f"{bad.mean():.0%}", path)
-    return bad
 
 
 def count_saturated(image: Num[np.ndarray, "row column"]) -> tuple[int, int] | None:

@@ -34,7 +34,8 @@ MAX_PIXELS = 10**9
 DTYPES = ("uint8", "uint16", "float32")
 CAPTURE_SUFFIXES = (*TIFF_SUFFIXES, ".png", ".npy")
 # Files of other programs, which are read alone, by `open_vendor`.
-VENDOR_SUFFIXES = (".nd2", ".czi", ".lif", ".h5", ".hdf5")
+HDF5_SUFFIXES = (".h5", ".hdf5")
+VENDOR_SUFFIXES = (".nd2", ".czi", ".lif", *HDF5_SUFFIXES)
 READ_SUFFIXES = (*CAPTURE_SUFFIXES, *VENDOR_SUFFIXES)
 # Pages that are chosen for files that go together: the one that a file has for itself, though it may be one of a set;
 # and all, if they are repeats of one image.
@@ -178,7 +179,7 @@ def of_channel(path: Path, source: Source, channel: str | None) -> Source:
     lengths = [length for _, length in source.axes]
     names = list(source.channels)
     names = names if len(names) == lengths[at] else [str(number) for number in range(1, lengths[at] + 1)]
-    lower, wanted = [name.lower() for name in names], (channel or "").lower()
+    lower, wanted = [name.lower() for name in names], (channel or "").strip().lower()
     if wanted in lower:
         chosen = lower.index(wanted)
     elif wanted.isdecimal() and 1 <= int(wanted) <= len(names):
@@ -196,6 +197,14 @@ def of_channel(path: Path, source: Source, channel: str | None) -> Source:
     return source._replace(
         axes=axes or [(UNNAMED, 1)], names=[source.names[k] for k in indices], read=read, channels=()
     )
+
+
+def is_grey(path: Path, page: int | str | None, channel: str | None) -> bool:
+    """Whether a file of captures is known to be grey: a channel named as a colour is then one along its axis."""
+    if channel not in CHANNELS or path.suffix.lower() not in TIFF_SUFFIXES:
+        return path.suffix.lower() in (".npy", *VENDOR_SUFFIXES)
+    with open_source(path, page) as source:
+        return any(name == "c" for name, _ in source.axes)
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -23,6 +23,7 @@ from ..base.typing import PathLike
 from .axes import UNNAMED, axis_letter, stack_error
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
 from .captures import (
+    HDF5_SUFFIXES,
     OWN,
     READ_SUFFIXES,
     VENDOR_SUFFIXES,
@@ -34,6 +35,7 @@ from .captures import (
     check_declared,
     check_images,
     check_stack,
+    is_grey,
     of_channel,
     open_source,
     read_images,
@@ -130,7 +132,10 @@ def capture_files(path: Path) -> list[Path] | None:
         matches = [Path(name) for name in glob.glob(_pattern(path), recursive=True)]
     else:
         return None
-    return natural_order(match for match in matches if is_capture(match.name) and not match.is_dir())
+    files = [match for match in matches if is_capture(match.name) and not match.is_dir()]
+    # HDF5 beside captures is more likely what was made of them, such as signals.
+    others = [file for file in files if file.suffix.lower() not in HDF5_SUFFIXES]
+    return natural_order(others or files)
 
 
 def is_capture(name: str) -> bool:
@@ -258,7 +263,9 @@ def read_spots(
                 shape = images[0].shape
                 if (key := (shape, own)) not in prepared:
                     cells = (shape[0] // 2, shape[1] // 2)
-                    prepared[key] = prepare(cells if own.bayer else shape, shape, own, correction)
+                    first = recording.files[:1] if recording else [path]
+                    grey = not first or is_grey(first[0], page, own.channel)
+                    prepared[key] = prepare(cells if own.bayer else shape, shape, own, correction, grey)
                 yield path, read_frame(name, iter(images), prepared[key], own)
 
 

@@ -10,18 +10,17 @@ import numpy as np
 
 from ..base.errors import InputError, input_error, needs_extra
 from .axes import UNNAMED, axis_letter
-from .captures import Selection, Source, check_colour, check_declared, listed
+from .captures import HDF5_SUFFIXES, Selection, Source, check_colour, check_declared, listed
 from .files import decoding
 
 # Packages of readers by the suffixes of their files.
 _READERS = {".nd2": "bioio_nd2", ".czi": "bioio_czi", ".lif": "bioio_lif"}
-_HDF5 = (".h5", ".hdf5")
 
 
 @contextlib.contextmanager
 def open_vendor(path: Path) -> Iterator[Source]:
     """Open the image of a file; `InputError` if it cannot be read, has several or none, or its reader is missing."""
-    with _open_hdf5(path) if path.suffix.lower() in _HDF5 else _open_bioio(path) as source:
+    with _open_hdf5(path) if path.suffix.lower() in HDF5_SUFFIXES else _open_bioio(path) as source:
         yield source
 
 
