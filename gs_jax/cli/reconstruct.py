@@ -47,7 +47,7 @@ from .options import (
     depth_range,
     voxels,
 )
-from .recordings import RecordingOptions, SeriesRun, format_residual, print_failed_tiles, request_of
+from .recordings import RecordingOptions, SeriesRun, examine, print_failed_tiles, request_of
 
 
 @dataclass
@@ -206,14 +206,14 @@ def reconstruct_command(
         is_single_pass = options.method == "backproject" and plan.suppress != "points" and not points
         with compiled_for_cpu("xla") if is_single_pass else nullcontext():
             result = reconstruct(image, progress)
-        residual = plan.check(result.volume, image, progress) if plan.is_learned else None
+        noted, lines = examine(plan, result, image, progress)
         validation = plan.score(image, progress) if score or deviation else None
         predicted = _format_score(validation) if score else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, options.weights, *camera.files, design=microscope))
             provenance |= frame.note if imager.sample is not None else {}
             provenance |= {SCORE: predicted} if predicted else {}
-            provenance |= {} if result.sieve is None else {"sieve": f"{result.sieve:.3g} voxels"}
+            provenance |= noted
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)
             if deviation and validation:
                 own = provenance | {DEVIATION: f"of the voxels of {output.name}"}
@@ -225,10 +225,8 @@ def reconstruct_command(
                 write_surface(surface, *maps, plan.grid, below=frame.surface or 0.0, provenance=provenance)
     camera.print_corrections()
     click.echo(f"{output}: {voxels(result.volume.shape, 'z, y, x', plan.grid.pitch, depths, imager)}")
-    if residual:
-        click.echo(f"{output}: imaged again it is {format_residual(residual)}")
-    if result.sieve is not None:
-        click.echo(f"{output}: --sieve {result.sieve:.3g}, chosen by held-out pixels")
+    for line in lines:
+        click.echo(f"{output}: {line}")
     if predicted:
         click.echo(f"{output}: {predicted}")
     if deviation and validation:

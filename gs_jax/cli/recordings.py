@@ -410,6 +410,17 @@ def format_residual(residual) -> str:
     return f"{error}, {residual.regions.max():.0%} where it is farthest"
 
 
+def examine(plan, result, image, progress: Progress) -> tuple[dict[str, str], list[str]]:
+    """What provenance and a report say of the reconstruction of an image: the sieve, and how a network's fits it."""
+    lines = []
+    if plan.is_learned:
+        lines.append(f"imaged again it is {format_residual(plan.check(result.volume, image, progress))}")
+    if result.sieve is None:
+        return {}, lines
+    lines.append(f"--sieve {result.sieve:.3g}, chosen by held-out pixels")
+    return {"sieve": f"{result.sieve:.3g} voxels"}, lines
+
+
 def _print_notes(series) -> str:
     """Print how many frames were corrected or have warnings, with the first warning; return the check."""
     from ..io.ngff import JOURNAL
