@@ -15,10 +15,12 @@ from click.testing import CliRunner
 import gs_jax as gs
 from gs_jax import InputError
 from gs_jax.__main__ import commands
+from gs_jax.io.camera import Correction, Readout, read_corrected
 from gs_jax.io.captures import Selection, read_capture
+from gs_jax.io.files import decoding
 from gs_jax.io.ngff import ngff_attributes
-from gs_jax.io.provenance import read_provenance
-from gs_jax.io.recordings import open_recording
+from gs_jax.io.provenance import made_by, read_provenance
+from gs_jax.io.recordings import capture_files, open_recording
 
 from .test_matrix import cropped
 
@@ -174,6 +176,85 @@ def test_channels_that_are_not_there_are_named(tmp_path, monkeypatch, options, m
     assert not (tmp_path / "v.ome.tif").exists()
 
 
+@pytest.mark.parametrize(
+    "channel, said",
+    [
+        ("gfp", "--channel gfp: GFP at 510 nm"),
+        ("1", "--channel 1 is none of [channels] in the design, GFP, mCherry: 520 nm is used"),
+    ],
+)
+def test_the_wavelength_of_a_channel_is_said(tmp_path, monkeypatch, channel, said):
+    monkeypatch.chdir(tmp_path)
+    two_channels(tmp_path)
+    line = f"reconstruct both.ome.tif my.toml --channel {channel} --depths 19:21:1 --voxel-um 100 -o v.ome.tif"
+    assert said in run(line)
+
+
+def test_channels_of_a_zarr_store_become_one_image(tmp_path, monkeypatch):
+    zarr = pytest.importorskip("zarr", reason="pip install 'gs-jax[zarr]'")
+    monkeypatch.chdir(tmp_path)
+    two_channels(tmp_path)
+    with tifffile.TiffFile("both.ome.tif") as file:
+        pixels = file.asarray()
+    axes, labels = [{"name": name} for name in "cyx"], [{"label": name} for name in NAMES]
+    image = {"axes": axes, "datasets": [{"path": "0"}]}
+    ome = {"version": "0.5", "multiscales": [image], "omero": {"channels": labels}}
+    zarr.create_group("both.zarr", attributes={"ome": ome}).create_array("0", data=pixels)
+    line = "reconstruct both.{} my.toml --channel {} --depths 19:21:1 --voxel-um 100 -o {}.ome.tif"
+    run(line.format("ome.tif", "GFP,mCherry", "a"))
+    run(line.format("zarr", "gfp,MCHERRY", "b"))
+    np.testing.assert_array_equal(tifffile.imread("a.ome.tif"), tifffile.imread("b.ome.tif"))
+
+
+@pytest.mark.parametrize("names", [NAMES, ["red", "blue"]])
+def test_grey_files_correct_a_channel(tmp_path, names):
+    tifffile.imwrite(tmp_path / "a.ome.tif", STACK[0], metadata={"axes": "CYX", "Channel": {"Name": names}}, ome=True)
+    mask, dark = np.zeros((12, 14), np.uint8), np.full((12, 14), 7, np.uint16)
+    mask[3, 4] = 255
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    tifffile.imwrite(tmp_path / "dark.tif", dark)
+    correction = Correction(tmp_path / "dark.tif", bad_pixels=tmp_path / "mask.tif")
+    found = read_corrected(tmp_path / "a.ome.tif", readout=Readout(channel=names[1]), correction=correction)
+    expected = STACK[0, 1] - 7.0
+    expected[3, 4] = found.image[3, 4]
+    np.testing.assert_array_equal(found.image, expected)
+    assert found.done[-1] == "1 bad pixel filled from neighbours: 1 in mask.tif"
+    # A colour of a colour image is not corrected by a grey one.
+    tifffile.imwrite(tmp_path / "rgb.tif", np.zeros((12, 14, 3), np.uint16), photometric="rgb")
+    with pytest.raises(InputError, match=r"colour for --channel red.*mask.tif"):
+        read_corrected(
+            tmp_path / "rgb.tif",
+            readout=Readout(channel="red"),
+            correction=Correction(bad_pixels=tmp_path / "mask.tif"),
+        )
+
+
+def test_hdf5_beside_captures_is_no_frame(tmp_path):
+    for name in ("traces.h5", "a.HDF5"):
+        (tmp_path / name).write_bytes(b"")
+    assert len(capture_files(tmp_path) or []) == 2
+    gs.write_capture(tmp_path / "a.tif", STACK[0, 0])
+    assert capture_files(tmp_path) == capture_files(tmp_path / "*") == [tmp_path / "a.tif"]
+
+
+def test_a_missing_package_is_not_a_damaged_store(monkeypatch):
+    pytest.importorskip("zarr", reason="pip install 'gs-jax[zarr]'")
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    for read in (gs.read_volume, lambda path: open_recording(path).__enter__()):
+        with pytest.raises(InputError, match=r"^(fsspec|aiohttp) is not installed; .*'gs-jax\[zarr\]'"):
+            read("https://host.invalid/a.zarr")
+    with pytest.raises(InputError, match="^https://host.invalid/a.zarr: cannot be read: no route"):
+        with decoding("https://host.invalid/a.zarr", "Zarr store"):
+            raise OSError("no route")
+
+
+def test_provenance_leaves_out_the_queries_of_addresses():
+    url = "https://host/lab/a.zarr?key=K&signature=S"
+    table = made_by(f"gs-jax reconstruct '{url}' my.toml -o v.zarr", [url])
+    assert table["command"] == "gs-jax reconstruct 'https://host/lab/a.zarr' my.toml -o v.zarr"
+    assert table["input a.zarr"] == "https://host/lab/a.zarr" and "signature" not in str(table)
+
+
 def serve(folder):
     """A server of a folder on the loopback interface."""
 
@@ -202,7 +283,7 @@ def test_zarr_is_read_at_an_https_address(tmp_path):
         read, grid = gs.read_volume(f"{root}/v.zarr")
         np.testing.assert_array_equal(read, volume)
         assert np.asarray(grid.depths).tolist() == [18.0, 19.0, 20.0]
-        with pytest.raises(InputError, match=f"{root}/none.zarr: not a whole and valid Zarr"):
+        with pytest.raises(InputError, match=f"{root}/none.zarr: cannot be read: "):
             with open_recording(f"{root}/none.zarr"):
                 pass
         (tmp_path / "a.zarr/0/c/1/0/0/0").unlink()

@@ -285,17 +285,26 @@ class CaptureOptions(PictureOptions):
         self.sensor = imager.sensor
         return eqx.tree_at(lambda i: i.sensor, imager, self.readout.sensor(imager.sensor))
 
+    def read_frame(self, path: Path, recording):
+        """Read and correct the first frame of a recording, as `read` does a capture."""
+        image, done, warnings = self.frames(recording)(0)
+        self.done = dict.fromkeys([*done, *self.done], [path])
+        self.warnings |= dict.fromkeys(warnings)
+        return image
+
     def frames(self, recording):
         """Read the correction of a recording; return the function that reads a frame.
 
         It returns the frame's image, and lines about corrections and warnings of this frame alone.
         """
         from ..io.camera import prepare, read_frame
-        from ..io.captures import Selection
+        from ..io.captures import Selection, is_grey
 
         shape, readout = self.readout.region(self.sensor).shape, self.readout
         selection = Selection(shape, None, readout.channel, readout.bayer)
-        prepared = prepare(readout.sensor(self.sensor).shape, shape, readout, self.correction)
+        # Zarr stores, which have no files, are grey.
+        grey = not recording.files or is_grey(recording.files[0], self.page, readout.channel)
+        prepared = prepare(readout.sensor(self.sensor).shape, shape, readout, self.correction, grey)
         self.done = {line: [Path(f"{len(recording.names)} frames")] for line in prepared.done}
         shared = [*prepared.done, *prepared.warnings]
         self.warnings |= dict.fromkeys(prepared.warnings)
@@ -346,9 +355,20 @@ class Light(OptionGroup):
         return design.imager(sample, self.wavelength_nm)
 
     def of_channel(self, design, name: str | None) -> Any:
-        """These, with the wavelength that a design lists for a channel, unless another was given."""
-        listed = design.channels.get(name)
-        return self if listed is None or self.wavelength_nm else replace(self, wavelength_nm=listed.wavelength_nm)
+        """These, with the wavelength that a design lists for a channel, which is printed, unless another was given.
+
+        Warns if a design lists channels, but not this one.
+        """
+        if not name or not design.channels or self.wavelength_nm:
+            return self
+        listed = find_channel(design, name)
+        if listed not in design.channels:
+            names, used = ", ".join(design.channels), design.imaging.wavelength_nm
+            print_warning(f"--channel {name} is none of [channels] in the design, {names}: {used:g} nm is used")
+            return self
+        wavelength = design.channels[listed].wavelength_nm
+        click.echo(f"--channel {name}: {listed} at {wavelength:g} nm")
+        return replace(self, wavelength_nm=wavelength)
 
     def read_design(self, path: Path) -> Any:
         """Read a design, with these in place of its own; its working distance begins in the object's medium."""
@@ -395,6 +415,12 @@ class DepthLight(Light):
             raise InputError(f"--depths must be {NEAREST:g} mm or more from the array, got {min(moved):g}.")
         check_beyond(imager, moved, "--depths")
         return moved
+
+
+def find_channel(design, name: str) -> str:
+    """The name of a channel as a design spells it, whatever its case here; unchanged if the design does not list it."""
+    same = [own for own in design.channels if own.lower() == name.strip().lower()]
+    return name.strip() if name.strip() in same or not same else same[0]
 
 
 def objects_in(imager) -> str:
