@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
-from ..base.arrays import flat_warning
 from ..base.errors import InputError, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import TIFF_SUFFIXES, check_output
@@ -327,6 +326,7 @@ def deconvolve_command(
             as fit into memory.
         resume: Keep the tiles that an interrupted run left in VOLUME.zarr, if any, and make the others.
     """
+    from ..base.arrays import flat_warning
     from ..io.captures import write_capture
     from ..io.ngff import VolumeSeries, check_replaceable
     from ..io.recordings import spot_names

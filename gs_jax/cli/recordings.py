@@ -15,7 +15,6 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
-from ..base.arrays import flat_warning
 from ..base.errors import InputError, InputWarning
 from ..base.machine import accelerator, copy_to
 from ..base.progress import Progress
@@ -323,6 +322,7 @@ class SeriesRun:
 
 def print_failed_tiles(series) -> int:
     """Name the tiles of a volume that failed and are empty, warn if all is flat; return the exit status."""
+    from ..base.arrays import flat_warning
     from ..io.ngff import open_levels
 
     if series.exists and (text := flat_warning(np.asarray(open_levels(series.path, series.grid)[-1][:]))):

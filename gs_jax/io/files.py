@@ -19,10 +19,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ..base.errors import InputError, MissingExtraError, input_error, short_repr
-from .remote import remote_url
-
-# Not from `gs_jax.base.typing`, which imports JAX: the help of commands does without.
-PathLike = str | os.PathLike[str]
+from .remote import PathLike as PathLike, remote_url
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 MAX_TEXT_BYTES = 2**26

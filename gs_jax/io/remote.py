@@ -6,8 +6,9 @@ from importlib import import_module
 from typing import Any
 
 from ..base.errors import needs_extra
-from ..base.typing import PathLike
 
+# Not from `gs_jax.base.typing`, which imports JAX: the help of commands does without.
+PathLike = str | os.PathLike[str]
 # Of an address a `Path` keeps one slash.
 _ADDRESS = re.compile(r"(s3|https?):/+(.+)", re.DOTALL)
 
