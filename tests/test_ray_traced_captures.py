@@ -31,6 +31,7 @@ def test_plain_back_projection_shows_ray_traced_points():
     assert every.recall >= 0.95 and brightest.precision >= 0.9 and every.lateral_rmse <= 0.02
 
 
+@pytest.mark.slow
 def test_deviations_hold_for_ray_traced_letters():
     """Of bright voxels 49 % are right within one and 91 % within two, fewest of all scenes; ideal are 68 and 95 %."""
     needs("geomscope/centers.csv")
