@@ -302,15 +302,10 @@ def make_rig(design: Design, shape: HolderShape = HolderShape()) -> Rig:
 
 
 def _holder(rig: Holder) -> tuple[m3.Manifold, float]:
-    shape, (lower, upper), pocket = (
-        rig.shape,
-        rig.levels,
-        m3.CrossSection.square((2 * rig.pocket).tolist(), center=True),
-    )
+    shape, (lower, upper) = rig.shape, rig.levels
+    pocket = m3.CrossSection.square((2 * rig.pocket).tolist(), center=True)
     body = [(_disc(rig.rim), 0.0, _FLANGE), (_flattened(rig, 0.0), _FLANGE, rig.top)]
-    begin = 0.0
-    if shape.bore is None:
-        begin = -_THREAD
+    begin = -_THREAD if shape.bore is None else 0.0
     if rig.bottom < begin:
         body.append((_disc(rig.barrel), rig.bottom, begin))
     cuts = [(pocket, *sorted((rig.seat, rig.seat - rig.side * (rig.thickness + _GUARD))))]
@@ -384,9 +379,8 @@ def _thread(largest: float) -> tuple[m3.Manifold, float]:
     radius = largest - _ECCENTRICITY
     circle, middles = (np.stack([np.cos(angle), np.sin(angle)], -1) for angle in (around, turn))
     rings = radius * circle + _ECCENTRICITY * middles[:, None]
-    vertices = np.concatenate([rings, np.broadcast_to(heights[:, None, None], (*rings.shape[:2], 1))], -1).reshape(
-        -1, 3
-    )
+    levels = np.broadcast_to(heights[:, None, None], (*rings.shape[:2], 1))
+    vertices = np.concatenate([rings, levels], -1).reshape(-1, 3)
     lower = _SEGMENTS * np.arange(count)[:, None] + np.arange(_SEGMENTS)
     following = np.roll(lower, -1, axis=1)
     upper, above = lower + _SEGMENTS, following + _SEGMENTS

@@ -49,6 +49,7 @@ class Demixing(NamedTuple):
     `squares` are these weights, squared.
     """
 
+    shape: tuple[int, int]
     pixels: Int[np.ndarray, " pixel"]
     columns: Float32[np.ndarray, "column pixel"]
     weights: Float32[np.ndarray, " pixel"]
@@ -127,10 +128,10 @@ def prepare_demixing(regions: RegionImages, captures: Iterable[Image]) -> Demixi
 
     The variance is taken as a constant and a multiple of the light, fitted to what a fit with equal weights leaves.
 
-    Raises `InputError` if regions cast images that cannot be told apart.
+    Raises `InputError` if regions cast images that cannot be told apart, or captures have another shape.
     """
     columns = np.concatenate([regions.images, _modes(regions)])
-    parts = [np.asarray(capture, np.float32).ravel()[regions.pixels] for capture in captures]
+    parts = [_values(capture, regions) for capture in captures]
     mean = np.asarray(np.mean(parts, axis=0, dtype=np.float64))
     _check_distinct(regions)
     equal = _normal_equations(regions, columns, np.ones(len(mean), np.float32))
@@ -141,6 +142,13 @@ def prepare_demixing(regions: RegionImages, captures: Iterable[Image]) -> Demixi
     variance = np.maximum(variance, max(1e-6 * float(variance.max()), _TINY))
     weights = (variance.mean() / variance).astype(np.float32)
     return _normal_equations(regions, columns, weights)
+
+
+def _values(capture: Image, used: "RegionImages | Demixing") -> Float32[np.ndarray, " pixel"]:
+    """The pixels of a capture that are used."""
+    if capture.shape != used.shape:
+        raise InputError(f"capture must have the sensor's shape {used.shape}, got {capture.shape}.")
+    return np.asarray(capture, np.float32).ravel()[used.pixels]
 
 
 def _modes(regions: RegionImages) -> Float32[np.ndarray, "mode pixel"]:
@@ -178,7 +186,7 @@ def _normal_equations(regions: RegionImages, columns, weights) -> Demixing:
             f"region {regions.numbers[0]} must cast an image unlike the background, which is smooth."
         ) from None
     sums *= weights
-    return Demixing(regions.pixels, columns, weights, gram, factor, np.square(sums, out=sums))
+    return Demixing(regions.shape, regions.pixels, columns, weights, gram, factor, np.square(sums, out=sums))
 
 
 def _explain(system: Demixing, values: Float32[np.ndarray, " pixel"]):
@@ -199,14 +207,14 @@ def _solve(system: Demixing, values: Float32[np.ndarray, " pixel"]) -> Float32[n
 
 
 def demix(capture: Image, system: Demixing) -> Demixed:
-    """Return the light of each region in a capture.
+    """Return the light of each region in a capture; `InputError` if it has another shape.
 
     The standard error is that of least squares without bounds, from what is left in each pixel, whatever its variance
     (White, Econometrica 48, 817, 1980), as if pixels were independent. It has the noise and, in part, what the model
     lacks. An error of a region's place or image that is the same in all captures changes the scale of its trace, which
     the standard error does not tell.
     """
-    values = np.asarray(capture, np.float32).ravel()[system.pixels]
+    values = _values(capture, system)
     solution = _solve(system, values)
     left = values - solution @ system.columns
     variance = system.squares @ left**2 * (len(values) / max(len(values) - len(solution), 1))
