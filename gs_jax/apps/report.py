@@ -382,7 +382,7 @@ def _draw_deviation(volume: np.ndarray, deviation: np.ndarray, grid: Grid) -> Fi
     for axes, part, title in zip(both, maps, ("brightness", "standard deviation"), strict=True):
         axes.imshow(part, "viridis", vmin=0, vmax=high, extent=grid.extent)
         axes.set(title=title, xlabel="x, mm", ylabel="y, mm")
-    figure.colorbar(both[0].images[0], ax=both)
+    figure.colorbar(both[0].images[0], ax=both, label="value of a voxel")
     return figure
 
 

@@ -8,6 +8,7 @@ from matplotlib import colormaps
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 
 from ..io.traces import SIGNALS
 from ..microscope.grid import Grid
@@ -97,6 +98,8 @@ def draw_traces(
         ends = np.argmin(columns["frame"]), np.argmax(columns["frame"])
         step = np.ptp(columns["time_s"][[*ends]]) / (np.ptp(frames) or 1) or 1.0
         edges = columns["time_s"][ends[0]] + step * (edges - frames[0])
+    else:
+        heat.xaxis.set_major_locator(MaxNLocator(integer=True))
     rows = np.arange(len(numbers) + 1)
     picture = heat.pcolorfast(edges, rows, values, cmap="viridis", vmin=low, vmax=high)
     heat.set(xlabel="time, s" if timed else "frame", ylabel="region", title="Signals over time", ylim=(rows[-1], 0))
