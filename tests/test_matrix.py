@@ -27,6 +27,7 @@ from gs_jax.base.errors import InputWarning
 from gs_jax.base.progress import Progress
 from gs_jax.base.workers import Workers
 from gs_jax.calibration.fit import PATTERN_FITTED
+from gs_jax.codesign.bound import volume_bound
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.tables import LENS_KEYS
@@ -442,6 +443,11 @@ def mold(case: Case, folder: Path) -> None:
     assert write_heights(case.design, folder / "heights.dat", step=0.1)["deviation_nm"] < 1
 
 
+def bounded(case: Case, _) -> None:
+    gain = volume_bound(case.imager, case.grid.depths)
+    assert 0 < gain.design < gain.most
+
+
 def held(case: Case, folder: Path) -> None:
     rig = make_rig(case.design, HolderShape(flange=case.design.imaging.sensor_distance_mm, bore=60.0, bolts=80.0))
     for solid, volume in ((rig.holder, rig.holder_volume), (rig.target, rig.target_volume)):
@@ -463,6 +469,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     "follow": followed,
     "tiles": tiled,
     "demix": demixed,
+    "bound": bounded,
     "calibrate": calibrate,
     "pattern": pattern,
     "metrics": metrics,
@@ -526,7 +533,7 @@ ONCE = {
 
 # A score and a radius are reconstructions of pixels that are masked the same way for every lens, and frames that follow
 # are starts of solvers that all devices have: so on the richest devices.
-ON_THE_RICHEST = ("score", "deviation", "radius", "follow", "tiles", "demix")
+ON_THE_RICHEST = ("score", "deviation", "radius", "follow", "tiles", "demix", "bound")
 RICHEST = ("geomscope", "curved, tilted, two radii, layers", "one lens")
 # Devices that differ from others in their files alone, or in size.
 FEW = ("samples", "small lenses")
