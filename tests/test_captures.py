@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+import tifffile._imagecodecs
 import zarr
 from click.testing import CliRunner
 from PIL import Image, UnidentifiedImageError
@@ -486,6 +487,9 @@ def test_big_endian_stacks_of_one_entry(tmp_path, dtype, bigtiff):
 def test_a_missing_decoder_is_named_whatever_fails_first(tmp_path, monkeypatch):
     """As a module, or in tifffile's words. Pillow always has LZW: what it cannot decode is damaged."""
     monkeypatch.setitem(sys.modules, "compression.zstd", None)
+    # What tifffile falls back on where imagecodecs is not installed; it keeps the decoders that it has found.
+    monkeypatch.setattr("tifffile.tifffile.imagecodecs", tifffile._imagecodecs)
+    monkeypatch.setattr("tifffile.tifffile.TIFF.DECOMPRESSORS._codecs", {1: lambda data: data})
     monkeypatch.setattr("gs_jax.io.tiff.Image.open", lambda *_, **__: (_ for _ in ()).throw(UnidentifiedImageError()))
     for code, name in {50000: "ZSTD", 34712: "JPEG2000", 34887: "LERC", 50001: "WEBP", 5: "LZW"}.items():
         tifffile.imwrite(tmp_path / "a.tif", GREY, compression="zlib")
