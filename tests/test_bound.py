@@ -19,15 +19,16 @@ SCOPE = geomscope().imager()
 lost = jax.jit(lambda plate, at: lost_by_any(eqx.tree_at(lambda i: i.array.size, SCOPE, plate), at))
 
 
-def test_of_one_plane_is_wieners_error_with_the_light_of_the_plates_solid_angle():
+@pytest.mark.parametrize("detail", [0.04, 0.016])
+def test_of_one_plane_is_wieners_error_with_the_light_of_the_plates_solid_angle(detail):
     plate, depth = 6.0, 20.0 - float(SCOPE.reduced_depth(0.0))
-    found = lost(jnp.full(2, plate), Conditions([depth], exposure=3.0))[0]
+    found = lost(jnp.full(2, plate), Conditions([depth], exposure=3.0, detail=detail))[0]
     # From above the middles of the nine squares: solid angles of the four rectangles beside each.
     angle = lambda a, b: np.arctan(a * b / (20 * np.sqrt(a**2 + b**2 + 20**2)))
     ends = [(plate / 2 - q, plate / 2 + q) for q in (-plate / 3, 0, plate / 3)]
     expected = []
-    v = np.linspace(0, 12.5, 4001)
-    spectrum = np.asarray(_spectrum(jnp.asarray(v)))
+    v = np.linspace(0, 0.5 / detail, 4001)
+    spectrum = np.asarray(_spectrum(jnp.asarray(v), detail))
     for x in ends:
         for y in ends:
             solid = sum(angle(a, b) for a in x for b in y)

@@ -123,7 +123,7 @@ def test_a_lens_and_a_plane_are_wieners_filter():
     c = c._replace(at=dataclasses.replace(c.at, depths=c.at.depths[:1]))
     magnification = float(c.imager.magnification(c.at.depths)[0])
     nodes = (np.arange(4000) + 0.5) / 4000 * 12.5
-    spectrum = linear_error._spectrum(nodes)
+    spectrum = linear_error._spectrum(nodes, 0.04)
     spots = spots_of_types(*c, jnp.zeros(1), jnp.array(nodes / magnification))
     # Of 3 % of emitters of 40 um: under the lens, and of the plate's 16 mm^2 spread over the sensor.
     whole = float(spots.electrons[0, 0]) / 0.04**2

@@ -55,6 +55,7 @@ def metrics_command(
     depths: DepthList | None = None,
     confusion_um: Um | None = None,
     bound: bool = False,
+    detail_um: Um | None = None,
     light: Light,
 ):
     """Show what the microscope of DESIGN resolves (the paper's Eqs. 1-11, and exact rays), in five lines.
@@ -68,6 +69,7 @@ def metrics_command(
         depths: START:STOP:STEP in mm. [default: seven in the working distance]
         confusion_um: Diameter of the circle of confusion, um. [default: two pixels]
         bound: Also compare the error of volumes with the least that any lenses on this plate could have.
+        detail_um: With --bound, width of the scenes' voxels, um. [default: 40]
     """
     from rich.console import Console
 
@@ -75,7 +77,10 @@ def metrics_command(
     from ..codesign.bound import bound_sheet, format_bound
     from ..design.datasheets import datasheet, findings, overview, summary, tables
     from ..microscope.geometry import check_beyond
+    from ..objectives import Conditions
 
+    if detail_um is not None and not bound:
+        raise InputError("--detail-um is the scenes' for --bound, which was not given.")
     check_outputs(json, [".json"], inputs=(design,))
     circle_of_confusion = confusion_um and confusion_um / 1000
     microscope = light.read_design(design)
@@ -83,7 +88,8 @@ def metrics_command(
         check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
     if bound:
-        sheet["bound"] = bound_sheet(microscope.imager(), sheet["depth_mm"])
+        detail = 0.04 if detail_um is None else detail_um / 1000
+        sheet["bound"] = bound_sheet(microscope.imager(), Conditions(sheet["depth_mm"], detail=detail))
     if json:
         write_json(json, sheet)
     click.echo(summary(microscope, sheet))

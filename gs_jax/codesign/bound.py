@@ -23,7 +23,7 @@ and angle for all depths, their means. Otherwise such differences would tell pla
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -68,8 +68,8 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     *Compiled.*
 
     Scenes are random planes at the depths, as wide as the plate, independent of each other, of objects with edges that
-    fill 3 %. The bound depends on the size of the plate, the depths, the object's medium and the exposure. Each ray
-    that crosses the plate ends in at most one pixel, so no linear estimate from an image is better than the best one
+    fill 3 %, on voxels of 40 um. The bound depends on the size of the plate, the depths, the object's medium, the
+    voxels and the exposure. Each ray that crosses the plate ends in at most one pixel, so no linear estimate from an image is better than the best one
     from all rays, each known by its place and direction, with shot noise. Losses, overlap and read noise are left out,
     and the number of pixels. Estimates with a positivity constraint may exceed it for sparse scenes.
 
@@ -78,7 +78,7 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     imager
         Lenses of any number of types on a plate with a size.
     depths
-        Of the planes from the array's front, `(depth,)`, mm, or `Conditions`, which have an exposure, too. The more
+        Of the planes from the array's front, `(depth,)`, mm, or `Conditions`, which have an exposure and voxels, too. The more
         planes there are between the same depths, the lower is the bound.
 
     Returns
@@ -102,11 +102,12 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     return VolumeBound(_gain(_lost_by_design(imager, at)), _gain(lost_by_any(imager, at)))
 
 
-def bound_sheet(imager: Imager, depths: Depths) -> dict[str, list[float]]:
+def bound_sheet(imager: Imager, depths: Depths) -> dict[str, Any]:
     """`volume_bound` at three exposures, as numbers for a datasheet."""
     at = as_conditions(imager, depths)
     gains = _at_exposures(imager, at, jnp.asarray(EXPOSURES, at.depths.dtype))
-    return {"exposure": list(EXPOSURES), "design_db": gains.design.tolist(), "most_db": gains.most.tolist()}
+    sheet = {"detail_um": round(1000 * float(at.detail), 3), "exposure": list(EXPOSURES)}
+    return sheet | {"design_db": gains.design.tolist(), "most_db": gains.most.tolist()}
 
 
 @eqx.filter_jit
@@ -114,13 +115,13 @@ def _at_exposures(imager, at, exposures) -> VolumeBound:
     return jax.vmap(lambda exposure: volume_bound(imager, dataclasses.replace(at, exposure=exposure)))(exposures)
 
 
-def format_bound(sheet: dict[str, list[float]], planes: int) -> str:
+def format_bound(sheet: dict[str, Any], planes: int) -> str:
     """A sentence about a design and its bound."""
     own, most = sheet["design_db"], sheet["most_db"]
     shares = _listed([100 * gain / best for gain, best in zip(own, most, strict=True)], "{:.0f}")
     return (
         f"at exposures of {_listed(sheet['exposure'], '{:g}')} the best linear estimate of scenes of {planes} planes "
-        f"gains {_listed(own, '{:.1f}')} dB over an empty volume, by any array of this size, light and depth at most "
+        f"of voxels of {sheet['detail_um']:g} um gains {_listed(own, '{:.1f}')} dB over an empty volume, by any array of this size, light and depth at most "
         f"{_listed(most, '{:.1f}')}: the design has {shares} % of that"
     )
 

@@ -43,11 +43,11 @@ from ..optics import theory
 from ..optics.pupil import pupil_quadrature, solid_angle, transmittance
 from ..optics.raytrace import refract
 
-# Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
-FILL, _LENGTH = 0.03, 0.05
+# Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, in voxels.
+FILL, _LENGTH = 0.03, 1.25
 # Read noise, electrons.
 _READ_NOISE = 2.0
-# Nodes of the quadrature over frequencies, up to Nyquist of voxels of 40 um.
+# Nodes of the quadrature over frequencies, up to Nyquist of the scene's voxels.
 _NODES = 16
 # Squares along a side of the plate; an object in the middle of each stands for the square.
 _SQUARES = 3
@@ -119,11 +119,12 @@ class Scene(NamedTuple):
 def scene_of(imager: Imager, at: Conditions) -> Scene:
     """The scene of `volume_error`, a plane at each depth."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    dtype, finest, magnification = at.depths.dtype, 1 / (2 * EMITTER_SIDE), imager.magnification(at.depths)
+    dtype, magnification = at.depths.dtype, imager.magnification(at.depths)
+    detail = at.detail.astype(dtype)
     # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
-    object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
+    object_frequency = jnp.asarray((nodes + 1) / 4, dtype) / detail
     frequency = object_frequency / jnp.mean(magnification)
-    spectrum = _spectrum(magnification[:, None] * frequency[None])
+    spectrum = _spectrum(magnification[:, None] * frequency[None], detail)
     share = (jnp.asarray(weights, dtype) * object_frequency)[None] * spectrum
     return Scene(frequency, spectrum, share / jnp.sum(share, 1, keepdims=True))
 
@@ -194,9 +195,10 @@ def noise_density(imager: Imager, at: Conditions, views: View) -> Float[Array, "
     return FILL / EMITTER_SIDE**2 * (own + over) + (_READ_NOISE / sensor.pixel_pitch) ** 2
 
 
-def _spectrum(frequency):
+def _spectrum(frequency, detail):
     """Power spectrum of random objects with edges, whose correlation falls exponentially (Debye), mm^2."""
-    return FILL * (1 - FILL) * 2 * jnp.pi * _LENGTH**2 / (1 + (2 * jnp.pi * _LENGTH * frequency) ** 2) ** 1.5
+    length = _LENGTH * detail
+    return FILL * (1 - FILL) * 2 * jnp.pi * length**2 / (1 + (2 * jnp.pi * length * frequency) ** 2) ** 1.5
 
 
 def directions(dtype) -> Float[Array, "2 direction"]:

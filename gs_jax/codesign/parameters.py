@@ -153,6 +153,7 @@ def evaluated(
     circle_of_confusion: float | None = None,
     depth_count: int = 6,
     exposure: float = 1e4,
+    detail: float = 0.04,
     free: Collection[str] = (),
 ) -> tuple[Imager, Conditions]:
     """The imager of a design and the conditions under which a search evaluates it.
@@ -165,7 +166,7 @@ def evaluated(
         Diameter of the circle of confusion, mm; two pixels by default.
     depth_count
         Depths between them, both included.
-    exposure
+    exposure, detail
         As of `Conditions`.
     free
         Names of the parameters that will be replaced.
@@ -179,6 +180,7 @@ def evaluated(
         depths_between(jnp.asarray((near + far) / 2, dtype), jnp.asarray(far - near, dtype), depth_count),
         circle_of_confusion,
         exposure=exposure,
+        detail=detail,
         directions=_EDGES,
     )
     return imager, at

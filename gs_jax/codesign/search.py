@@ -85,7 +85,8 @@ def problem_of(design: Design, study: Study) -> Problem:
     check_design(design, study)
     circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
     where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
-    return Problem(*evaluated(design, **where, exposure=study.exposure, free=study.free), study)
+    scene = {"exposure": study.exposure, "detail": study.detail_um / 1000}
+    return Problem(*evaluated(design, **where, **scene, free=study.free), study)
 
 
 @eqx.filter_jit

@@ -165,11 +165,12 @@ class Study(Table):
 
     `margin`: fraction by which targets are tightened during the search, so that the rounded result meets them.
     `exposure`: electrons that each mm^2 of clear aperture, 20 mm away in air, would collect without losses from an
-    emitter of 40 um x 40 um, for terms that count light. `orientation`: side of the lenses toward the object, if it is
-    not the design's. `sample`: of the design's `[samples]`, or "none", the one that holds the object; it becomes that
-    of the new design, and must be given if the design has several and no `[sample]`. `types`: number of lens types
-    (`kinds` in earlier versions, which is still read); lenses that are alike are divided into so many types, with radii
-    spread over the depths, and each type has its own radius, aperture and conic constant.
+    emitter of 40 um x 40 um, for terms that count light. `detail_um`: width of the scene's voxels, for `volume_error`.
+    `orientation`: side of the lenses toward the object, if it is not the design's. `sample`: of the design's
+    `[samples]`, or "none", the one that holds the object; it becomes that of the new design, and must be given if the
+    design has several and no `[sample]`. `types`: number of lens types (`kinds` in earlier versions, which is still
+    read); lenses that are alike are divided into so many types, with radii spread over the depths, and each type has
+    its own radius, aperture and conic constant.
     `starts`: number of starts of the first stage; all but the first are random within the bounds, and the best goes on.
     `seed`: of random numbers.
     """
@@ -183,6 +184,7 @@ class Study(Table):
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")
     exposure: Positive = Field(default=1e4, description="a positive number of electrons")
+    detail_um: Positive = Field(default=40.0, description="a positive number of micrometres")
     margin: float = Field(default=0.005, ge=0, le=0.5, description="a number from 0 to 0.5")
     starts: int = Field(default=1, ge=1, le=10_000, description="a whole number from 1 to 10000")
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="a whole number from 0 to 2147483647")

@@ -36,6 +36,9 @@ class Conditions(eqx.Module):
     exposure
         Electrons that each mm^2 of clear aperture, 20 mm away in air, would collect without losses from an emitter of
         40 um x 40 um.
+    detail
+        Width of the voxels of the scenes that `volume_error` and `volume_bound` are for, mm; objects in them are five
+        quarters of that wide.
     directions
         Number of directions in which the edge of a clear aperture is computed, where lenses differ.
     clear_diameter
@@ -58,6 +61,7 @@ class Conditions(eqx.Module):
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     circle_of_confusion: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     exposure: Float[Array, ""] = eqx.field(converter=as_float, default=1e4)
+    detail: Float[Array, ""] = eqx.field(converter=as_float, default=0.04)
     directions: int = eqx.field(static=True, default=512)
     clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
@@ -67,7 +71,8 @@ class Conditions(eqx.Module):
     def __check_init__(self):
         if self.depths.ndim != 1:
             raise ValueError(f"`depths` must be (depth,), got {self.depths.shape}.")
-        check_fields(self, depths=POSITIVE, circle_of_confusion=POSITIVE, exposure=POSITIVE, field_radius=POSITIVE)
+        lengths = {name: POSITIVE for name in ("depths", "circle_of_confusion", "detail", "field_radius")}
+        check_fields(self, exposure=POSITIVE, **lengths)
 
     @property
     def middle(self) -> "Conditions":
