@@ -69,17 +69,18 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
 
     Scenes are random planes at the depths, as wide as the plate, independent of each other, of objects with edges that
     fill 3 %, on voxels of 40 um. The bound depends on the size of the plate, the depths, the object's medium, the
-    voxels and the exposure. Each ray that crosses the plate ends in at most one pixel, so no linear estimate from an image is better than the best one
-    from all rays, each known by its place and direction, with shot noise. Losses, overlap and read noise are left out,
-    and the number of pixels. Estimates with a positivity constraint may exceed it for sparse scenes.
+    voxels and the exposure. Each ray that crosses the plate ends in at most one pixel, so no linear estimate from an
+    image is better than the best one from all rays, each known by its place and direction, with shot noise. Losses,
+    overlap and read noise are left out, and the number of pixels. Estimates with a positivity constraint may exceed it
+    for sparse scenes.
 
     Parameters
     ----------
     imager
         Lenses of any number of types on a plate with a size.
     depths
-        Of the planes from the array's front, `(depth,)`, mm, or `Conditions`, which have an exposure and voxels, too. The more
-        planes there are between the same depths, the lower is the bound.
+        Of the planes from the array's front, `(depth,)`, mm, or `Conditions`, which have an exposure and voxels, too.
+        The more planes there are between the same depths, the lower is the bound.
 
     Returns
     -------
@@ -121,8 +122,8 @@ def format_bound(sheet: dict[str, Any], planes: int) -> str:
     shares = _listed([100 * gain / best for gain, best in zip(own, most, strict=True)], "{:.0f}")
     return (
         f"at exposures of {_listed(sheet['exposure'], '{:g}')} the best linear estimate of scenes of {planes} planes "
-        f"of voxels of {sheet['detail_um']:g} um gains {_listed(own, '{:.1f}')} dB over an empty volume, by any array of this size, light and depth at most "
-        f"{_listed(most, '{:.1f}')}: the design has {shares} % of that"
+        f"of voxels of {sheet['detail_um']:g} um gains {_listed(own, '{:.1f}')} dB over an empty volume, by any array "
+        f"of this size, light and depth at most {_listed(most, '{:.1f}')}: the design has {shares} % of that"
     )
 
 
