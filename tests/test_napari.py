@@ -16,9 +16,10 @@ import pytest
 from gs_jax import Grid
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import read_volume, write_surface, write_volume
-from gs_jax.reconstruction import pipeline
+from gs_jax.solvers import base
 
 from .helpers import DESIGN
+from .test_recording import bead_frames
 
 MANIFEST = Path(__file__).parents[1] / "gs_jax" / "napari.yaml"
 # What napari and its libraries use of each other is theirs to renew.
@@ -148,7 +149,7 @@ def test_a_file_becomes_what_the_command_writes(widget, viewer, folder, run):
 
 def test_a_layer_becomes_points_in_the_same_place(widget, viewer):
     """The capture is put where the sensor is, so that all layers are in um, and the middle depth is shown."""
-    pixels = np.random.default_rng(0).integers(90, 110, (96, 80)).astype(np.uint16)
+    (pixels,) = bead_frames([[0.1]])
     viewer.add_image(np.zeros((3, 96, 80)), name="a stack")
     viewer.layers.clear()
     capture = viewer.add_image(pixels, name="seen")
@@ -169,7 +170,7 @@ def test_a_layer_becomes_points_in_the_same_place(widget, viewer):
 def fourth_step(widget, folder, monkeypatch):
     """A run that waits in its fourth step, in another thread, while this one is free: the threads of steps, and what
     lets it go on."""
-    step, taken, goes_on = pipeline._step, [], threading.Event()
+    step, taken, goes_on = base._step_in_place, [], threading.Event()
 
     def slow(*arguments):
         taken.append(threading.current_thread())
@@ -177,7 +178,7 @@ def fourth_step(widget, folder, monkeypatch):
             assert goes_on.wait(_LONGEST)
         return step(*arguments)
 
-    monkeypatch.setattr(pipeline, "_step", slow)
+    monkeypatch.setattr(base, "_step_in_place", slow)
     widget.file.value, widget.method.value = folder / "capture.tif", "list-rl"
     widget.run.clicked.emit(True)
     until(widget, lambda: widget.status.value.startswith("Iterating: 3 of 20, about "))
