@@ -183,12 +183,11 @@ def _of_volumes(source: Path, regions, from_points, radius, summary: str, progre
     shape = grid.volume_shape
     labels = read_labels(regions, shape) if regions else None
     if from_points:
-        step = np.ptp(np.asarray(grid.depths, float)) / max(shape[0] - 1, 1) or grid.pitch
         with errors_name_file(from_points):
             points = read_scene_points(from_points)
             if not len(points):
                 raise InputError("must have points, got none.")
-            labels = traces.regions_of_points(points, grid, radius or (1.5 * grid.pitch, step))
+            labels = traces.regions_of_points(points, grid, radius)
     over_time = traces.SummaryVolumes(shape)
     for frame in progress.track(frames, "Reading volumes"):
         over_time.add(np.asarray(volumes[frame]))
@@ -197,7 +196,7 @@ def _of_volumes(source: Path, regions, from_points, radius, summary: str, progre
         with progress.step("Segmenting"), errors_name_file(source):
             labels = traces.segment(image)
     signals = traces.RegionSignals(labels)
-    rows = [signals(np.asarray(volumes[frame])) for frame in progress.track(frames, "Measuring")]
+    rows = list(signals.measure(volumes, progress.track(frames, "Measuring")))
     means, backgrounds = (np.array(part) for part in zip(*rows, strict=True))
     emitters = traces.emitters_of_regions(labels, over_time.mean, backgrounds.mean(0), grid)
     places = np.array([[part[:, :3].T @ part[:, 3] for part in emitters]])

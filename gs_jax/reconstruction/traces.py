@@ -1,7 +1,8 @@
 """Signals of regions of a recording over time: means above the background about each region, and dF/F. Host code."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
@@ -18,6 +19,7 @@ from ..microscope.grid import Grid
 
 Labels = Int[np.ndarray, "depth y x"]
 Signals = Float[np.ndarray, "frame region"]
+Means = Float64[np.ndarray, " region"]
 
 # Standard deviation, in voxels of a plane, by which a volume is smoothed before it is segmented, the neighbourhood
 # (z, y, x) of which a seed is the brightest voxel, and fewest voxels of a region.
@@ -71,25 +73,34 @@ def segment(volume: Volume) -> Labels:
     return labels.astype(np.int32)
 
 
-def regions_of_points(points: Float[np.ndarray, "point _"], grid: Grid, radius: tuple[float, float]) -> Labels:
+def regions_of_points(
+    points: Float[np.ndarray, "point _"], grid: Grid, radius: tuple[float, float] | None = None
+) -> Labels:
     """Give each point the voxels within a radius, lateral and axial, mm, that are nearer to it than to other points.
 
-    Regions have the numbers of the points, from 1. The voxel that is nearest to a point is its own.
+    The radius is 1.5 voxels and 1 plane unless it is given. Regions have the numbers of the points, from 1. The voxel
+    that is nearest to a point is its own.
 
     Raises `InputError` if a point is outside the grid, or shares its voxel with another one.
     """
-    scale = np.array([radius[0], radius[0], radius[1]])
-    tree, labels = KDTree(points[:, :3] / scale), np.zeros(grid.volume_shape, np.int32)
-    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
+    axes = z, y, x = [np.asarray(axis, np.float64) for axis in (grid.depths, grid.y, grid.x)]
+    step = [np.ptp(axis) / max(len(axis) - 1, 1) or math.inf for axis in axes]
+    lateral, axial = radius or (1.5 * grid.pitch, step[0] if len(z) > 1 else grid.pitch)
+    scale = np.array([lateral, lateral, axial])
+    scaled = points[:, :3] / scale
+    tree, labels = KDTree(scaled), np.zeros(grid.volume_shape, np.int32)
+    planes, rows, columns = (
+        np.flatnonzero([np.abs(scaled[:, n] - at).min() <= 1 for at in axis / scale[n]])
+        for n, axis in zip((2, 1, 0), axes, strict=True)
+    )
     # Plane by plane, as the places of all voxels may need more memory than the volume.
-    for plane, depth in zip(labels, z, strict=True):
-        places = np.stack(np.meshgrid(y, x, [depth], indexing="ij"), -1)[:, :, 0][..., [1, 0, 2]] / scale
+    for plane in planes:
+        places = np.stack(np.meshgrid(x[columns], y[rows], z[plane]), -1)[:, :, 0] / scale
         nearest = tree.query(places, distance_upper_bound=1.0)[1]
-        plane[...] = np.where(nearest < len(points), nearest + 1, 0)
+        labels[plane, rows[:, None], columns] = np.where(nearest < len(points), nearest + 1, 0)
     for number, point in enumerate(points, 1):
-        index = tuple(int(np.abs(axis - at).argmin()) for axis, at in zip((z, y, x), point[2::-1], strict=True))
-        step = [np.ptp(axis) / max(len(axis) - 1, 1) or math.inf for axis in (z, y, x)]
-        away = [abs(axis[i] - at) for axis, i, at in zip((z, y, x), index, point[2::-1], strict=True)]
+        index = tuple(int(np.abs(axis - at).argmin()) for axis, at in zip(axes, point[2::-1], strict=True))
+        away = [abs(axis[i] - at) for axis, i, at in zip(axes, index, point[2::-1], strict=True)]
         if any(distance > side for distance, side in zip(away, step, strict=True)):
             raise InputError(f"point {number} must be within the volume, got {np.round(point[:3], 4).tolist()} mm.")
         if tree.query(np.array([x[index[2]], y[index[1]], z[index[0]]]) / scale)[1] == number - 1:
@@ -143,11 +154,19 @@ class RegionSignals:
         place = np.argwhere(around) + [side.start for side in box]
         return np.ravel_multi_index(tuple(place.T), free.shape)
 
-    def __call__(self, volume: Volume) -> tuple[Float64[np.ndarray, " region"], Float64[np.ndarray, " region"]]:
+    def __call__(self, volume: Volume) -> tuple[Means, Means]:
         """Return the means of the regions and those of their backgrounds."""
         values = volume.ravel()
         means = np.bincount(self._owner, values[self._inside], len(self.numbers)) / self.sizes
         return means, np.array([values[voxels].mean(dtype=np.float64) for voxels in self._around])
+
+    def measure(self, volumes: Any, frames: Iterable[int]) -> Iterator[tuple[Means, Means]]:
+        """Yield the same of frames of an array `(frame, depth, y, x)`, from which only planes in use are read."""
+        used = np.concatenate([self._inside, *self._around]) // math.prod(volumes.shape[2:])
+        planes, volume = slice(used.min(), used.max() + 1), np.zeros(volumes.shape[1:], np.float32)
+        for frame in frames:
+            volume[planes] = volumes[frame, planes]
+            yield self(volume)
 
 
 def relative_change(signals: Signals, percentile: float = 10.0, window: int | None = None) -> Signals:
