@@ -9,17 +9,21 @@ import threading
 import time
 import traceback
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gs_jax import Grid
 from gs_jax.io.point_tables import write_points
+from gs_jax.io.traces import read_traces
 from gs_jax.io.volumes import read_volume, write_surface, write_volume
 from gs_jax.solvers import base
 
 from .helpers import DESIGN
 from .test_recording import bead_frames
+from .test_traces import CELLS, GRID, recording  # noqa: F401
+from .test_widget_layers import tracks  # noqa: F401
 
 MANIFEST = Path(__file__).parents[1] / "gs_jax" / "napari.yaml"
 # What napari and its libraries use of each other is theirs to renew.
@@ -62,15 +66,20 @@ def widget(viewer, folder):
     return made
 
 
-def until(widget, what=lambda: False) -> None:
-    """Lets Qt work until the widget is done, or `what` is so."""
+def wait(what) -> None:
+    """Lets Qt work until `what` is so."""
     from qtpy.QtWidgets import QApplication
 
     began = time.monotonic()
-    while not (widget.run.enabled or what()):
+    while not what():
         QApplication.processEvents()
         assert time.monotonic() - began < _LONGEST
         time.sleep(0.001)
+
+
+def until(widget, what=lambda: False) -> None:
+    """Lets Qt work until the widget is done, or `what` is so."""
+    wait(lambda: widget.run.enabled or what())
 
 
 def errors() -> list[str]:
@@ -88,7 +97,7 @@ def test_the_manifest_is_valid(napari):
     manifest = PluginManifest.from_file(MANIFEST)
     manifest.validate_imports()
     made = manifest.contributions
-    assert [len(each or []) for each in (made.readers, made.widgets, made.sample_data)] == [1, 1, 1]
+    assert [len(each or []) for each in (made.readers, made.widgets, made.sample_data)] == [1, 2, 1]
 
 
 @pytest.mark.parametrize("name", ["v.ome.tif", "v.zarr"])
@@ -280,3 +289,115 @@ def test_live_replaces_the_layers_of_the_newest_capture(widget, viewer, folder):
 def test_live_needs_a_folder(widget):
     widget.live.clicked.emit(True)
     assert errors() == ["The folder must be one into which a camera writes, got none."]
+
+
+def click(viewer, *place, dragged: int = 0) -> None:
+    """Press the mouse at a place in the world, and release it so many pixels beside."""
+    from napari.utils.interactions import mouse_press_callbacks, mouse_release_callbacks
+
+    view = {"position": place, "view_direction": None, "dims_displayed": list(viewer.dims.displayed)}
+    event = SimpleNamespace(type="mouse_press", pos=(5, 5), button=1, modifiers=(), **view)
+    mouse_press_callbacks(viewer, event)
+    event.type, event.pos = "mouse_release", (5, 5 + dragged)
+    mouse_release_callbacks(viewer, event)
+
+
+@pytest.fixture
+def traces(viewer, recording):  # noqa: F811
+    """The widget of a viewer with a recording of cells in um."""
+    from npe2 import PluginManager
+
+    from gs_jax.widget.traces import Traces
+
+    PluginManager.instance().discover()
+    viewer.open(recording, plugin="gs-jax")
+    made = Traces(viewer)
+    yield made
+    made.native.deleteLater()
+
+
+def plotted(traces, title: str) -> list[np.ndarray]:
+    """Lines of the trace of this title when it is there: mean, background and dF/F over time."""
+    wait(lambda: traces.figure.axes and traces.figure.axes[0].get_title().startswith(title))
+    light, change = traces.figure.axes
+    return [np.array(line.get_data()) for line in (*light.lines[:2], *change.lines[:1])]
+
+
+def test_a_clicked_point_has_the_trace_that_the_command_writes(traces, viewer, folder, run):
+    """Of a point among others, which the one beside it lies near, and of a place in the volume."""
+    places = GRID.to_mm(np.array(CELLS)) + np.array([0.003, -0.004, 0.2])
+    write_points(folder / "p.csv", np.column_stack([places, np.ones(3)]))
+    write_points(folder / "one.csv", np.column_stack([places, np.ones(3)])[1:2])
+    (points,) = viewer.open(folder / "p.csv", plugin="gs-jax")
+    points.size = 60
+    world = (0.0, *1000 * places[1, ::-1])
+    viewer.dims.set_point((0, 1), (0.5, world[1]))
+    for title, table in (("Point 2 of p.csv: z 20200.0, y ", "p.csv"), ("Region: z 20200.0, y ", "one.csv")):
+        assert run("traces", "v.zarr", "--from-points", table, "-o", "t.csv", "--force")[0] == 0
+        rows = read_traces("t.csv")
+        click(viewer, *world, dragged=9)
+        click(viewer, *world)
+        lines = plotted(traces, title)
+        for line, name in zip(lines, ("mean", "background", "dff"), strict=True):
+            chosen = rows["region"] == (2 if table == "p.csv" else 1)
+            np.testing.assert_allclose(line, [rows["time_s"][chosen], rows[name][chosen]], rtol=1e-6)
+        points.visible = False
+    assert traces.figure.axes[1].lines[1].get_xdata() == (0.5,)
+    viewer.dims.set_point(0, 1.0)
+    assert traces.figure.axes[1].lines[1].get_xdata() == (1.0,)
+    # All points of a layer are measured at once.
+    points.visible = True
+    for number in (1, 3):
+        worker = traces.worker
+        viewer.dims.set_point(1, 1000 * places[number - 1, 2])
+        click(viewer, 0.0, *1000 * places[number - 1, ::-1])
+        plotted(traces, f"Point {number} of p.csv")
+    assert traces.worker is worker and errors() == []
+
+
+def test_points_of_a_frame_and_volumes_without_a_scale(traces, viewer):
+    """A layer of any program: its regions are in voxels, and points of other frames are in no way of it."""
+    volumes = viewer.layers[0].data[:]
+    viewer.layers.clear()
+    viewer.add_image(volumes, name="plain")
+    viewer.add_points([[0, *CELLS[0]], [1, *CELLS[0]], [1, *CELLS[1]]], name="cells", size=2)
+    traces.reset_choices()
+    viewer.dims.set_point((0, 1), (1, CELLS[0][0]))
+    click(viewer, 1.0, *CELLS[0])
+    (mean, *_), label = plotted(traces, "Point 2 of cells: z 1.0, y 10.0, x 12.0 pixel"), "t, pixel"
+    assert traces.figure.axes[1].get_xlabel() == label and mean[0].tolist() == [0, 1, 2, 3, 4]
+    z, y, x = CELLS[0]
+    inside = volumes[:, z, y - 1 : y + 2, x - 1 : x + 2].mean((1, 2))
+    np.testing.assert_allclose(mean[1], inside, rtol=1e-6)
+
+
+def test_what_has_no_trace_is_one_line(traces, viewer):
+    viewer.dims.set_point(1, 20000)
+    click(viewer, 0.0, 20000.0, 9000.0, 0.0)
+    assert errors() == ["Region must be within v.zarr, got z 20000.0, y 9000.0, x 0.0 µm."]
+    viewer.dims.ndisplay = 3
+    click(viewer, 0.0, 20000.0, 0.0, 100.0)
+    assert errors() == ["click in 3-D must be on a point, got none there."]
+    viewer.dims.ndisplay = 2
+    place = [20000.0, 0.0, 100.0]
+    viewer.add_points([place, place], size=100, units=("um",) * 3, axis_labels=tuple("zyx"))
+    click(viewer, 0.0, *place)
+    found = []
+    wait(lambda: found.extend(errors()) or found)
+    assert re.fullmatch("point . must have a voxel of its own, got one that is nearer to another point.", *found)
+    viewer.layers.clear()
+    traces.reset_choices()
+    click(viewer, 0.0, 20000.0, 0.0, 0.0)
+    assert errors() == ["recording must be an open layer of volumes over time (t, z, y, x), got none."]
+
+
+def test_tracks_lie_where_the_volume_is(viewer, tracks):  # noqa: F811
+    from npe2 import PluginManager
+
+    PluginManager.instance().discover()
+    (layer,) = viewer.open(tracks, plugin="gs-jax")
+    assert type(layer).__name__ == "Tracks" and [str(unit) for unit in layer.units] == ["second", *["micrometer"] * 3]
+    np.testing.assert_allclose(layer.extent.world, [[0, 20000, -100, 0], [1.5, 20600, 0, 300]])
+    assert layer.properties["duration_s"].tolist() == [0, 1.5, 1.5]
+    layer.color_by = "speed_mm_s"
+    assert np.isfinite(layer.track_colors).all()

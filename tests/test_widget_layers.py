@@ -9,8 +9,10 @@ import pytest
 
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import CancellableProgress, Cancelled
+from gs_jax.detection.particles import tracks_table
+from gs_jax.io.point_tables import write_points, write_rows
 from gs_jax.io.volumes import read_volume
-from gs_jax.widget.layers import Newest, newest_captures, prepare_layers
+from gs_jax.widget.layers import Newest, newest_captures, prepare_layers, reader
 
 
 def test_the_newest_result_is_never_lost():
@@ -69,3 +71,41 @@ def test_the_newest_capture_of_a_folder_is_made_until_the_user_cancels(tmp_path,
     cancelled.append(True)
     with pytest.raises(Cancelled):
         next(results)
+
+
+@pytest.fixture
+def tracks(tmp_path):
+    """A table of tracks, of a particle that moves and one that is seen once, and their points beside it."""
+    frames, particles = np.array([0, 0, 3]), np.array([4, 2, 4])
+    points = np.array([[0.0, 0.0, 20.0, 1.0], [0.2, -0.1, 20.5, 1.0], [0.3, 0.0, 20.6, 1.0]])
+    write_points(tmp_path / "p.csv", points, {"frame": frames, "particle": particles})
+    table = tracks_table(frames, particles, points[:, :3], 0.5)
+    write_rows(tmp_path / "p.csv.tracks.csv", table, zip(*table.values(), strict=True), None)
+    return tmp_path / "p.csv.tracks.csv"
+
+
+def test_tracks_are_lines_in_um_with_durations_and_speeds(tracks):
+    read = reader(str(tracks))
+    assert read is not None
+    ((vertices, described, kind),) = read(str(tracks))
+    assert kind == "tracks" and described["scale"] == (0.5, 1, 1, 1) and described["units"] == ("s", "um", "um", "um")
+    expected = [[4, 0, 20000, 0, 0], [2, 0, 20500, -100, 200], [4, 3, 20600, 0, 300]]
+    np.testing.assert_allclose(vertices, expected)
+    assert described["features"]["duration_s"].tolist() == [1.5, 0, 1.5]
+    np.testing.assert_allclose(
+        described["features"]["speed_mm_s"], [np.hypot(0.3, 0.6) / 1.5, 0, np.hypot(0.3, 0.6) / 1.5]
+    )
+
+
+def test_tracks_without_their_points_are_one_line(tracks):
+    read, beside = reader(str(tracks)), tracks.with_name("p.csv")
+    assert read is not None
+    write_points(beside, np.ones((2, 4)), {"frame": np.array([0, 1]), "particle": np.array([4, 4])})
+    with pytest.raises(InputError, match="tracks.csv: must have the particles of p.csv"):
+        read(str(tracks))
+    beside.unlink()
+    with pytest.raises(InputError, match="p.csv: cannot be read"):
+        read(str(tracks))
+    other = tracks.rename(tracks.with_name("t.csv"))
+    with pytest.raises(InputError, match="table of tracks must be named POINTS.csv.tracks.csv, got 't.csv'"):
+        read(str(other))

@@ -1,25 +1,30 @@
-"""Tables of traces, a row for each region and frame: CSV, or HDF5 with a data set for each column; and label images."""
+"""Tables of traces, a row for each region and frame: CSV, or HDF5 with a data set for each column.
+
+Also label images, and tables of tracks.
+"""
 
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tifffile
-from jaxtyping import Int, Shaped
+from jaxtyping import Float64, Int, Shaped
 
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..base.typing import PathLike
 from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .ngff import import_zarr
-from .point_tables import write_rows
+from .point_tables import read_point_columns, write_rows
 from .provenance import KEY, Provenance
 from .recordings import zarr_image
 
 TRACE_SUFFIXES = (".csv", ".h5")
 # Columns that every table of traces has.
 _NEEDED = ("region", "frame", "x_mm", "y_mm", "z_mm", "dff")
+# First columns of a table of tracks, whose name is that of its points and this.
+TRACKS_HEADER, TRACKS_SUFFIX = "particle,points,first_frame,last_frame", ".tracks.csv"
 # F, of which a table has one or more.
 SIGNALS = ("demixed", "intensity", "mean")
 
@@ -54,8 +59,7 @@ def read_traces(path: PathLike) -> dict[str, np.ndarray]:
             with h5py.File(path) as file:
                 columns = {name: np.asarray(file[name]) for name in file}
         else:
-            rows = np.genfromtxt(path, delimiter=",", names=True, dtype=float, ndmin=1, encoding="utf-8")
-            columns = {name: rows[name] for name in rows.dtype.names or ()}
+            columns = _read_csv(path)
     if missing := [name for name in _NEEDED if name not in columns]:
         raise InputError(f"{path}: must be a table of `gs-jax traces`, got no column {missing[0]}.")
     if len({values.shape for values in columns.values()}) > 1 or columns["dff"].ndim != 1 or not len(columns["dff"]):
@@ -63,6 +67,45 @@ def read_traces(path: PathLike) -> dict[str, np.ndarray]:
     if not np.isfinite(columns["dff"]).any() and not any(name in columns for name in SIGNALS):
         raise InputError(f"{path}: must be a table of `gs-jax traces`, got no signal: dff is nan in all rows.")
     return {name: values.astype(int) if name in _NEEDED[:2] else values for name, values in columns.items()}
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    """Columns by name, which may have NaN."""
+    rows = np.genfromtxt(path, delimiter=",", names=True, dtype=float, ndmin=1, encoding="utf-8")
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+class Tracks(NamedTuple):
+    """Points of particles in frames, columns of the tracks that they belong to, and seconds between frames if known."""
+
+    points: Float64[np.ndarray, "point 4"]
+    frames: Int[np.ndarray, " point"]
+    particles: Int[np.ndarray, " point"]
+    columns: dict[str, Float64[np.ndarray, " point"]]
+    interval: float | None
+
+
+def read_tracks(path: Path) -> Tracks:
+    """Read POINTS.csv.tracks.csv of `gs-jax reconstruct --track`, and POINTS.csv beside it.
+
+    Raises `InputError` if one of them cannot be read, is another table, or lacks particles of the other.
+    """
+    if not path.name.endswith(TRACKS_SUFFIX):
+        raise input_error("table of tracks", f"named POINTS.csv{TRACKS_SUFFIX}", short_repr(path.name))
+    with decoding(check_input(path), "table of tracks"):
+        table = _read_csv(path)
+        number, points, first, last = (table.pop(name) for name in TRACKS_HEADER.split(","))
+    beside = path.with_name(path.name.removesuffix(TRACKS_SUFFIX))
+    places, more = read_point_columns(beside)
+    frames, particles = (more.get(name, np.zeros(0)).astype(int) for name in ("frame", "particle"))
+    found, owner, counts = np.unique(particles, return_inverse=True, return_counts=True)
+    if not len(found) or not (np.array_equal(found, number) and np.array_equal(counts, points)):
+        raise InputError(f"{path}: must have the particles of {beside.name}, and there must be some.")
+    lasting, duration = last > first, table.get("duration_s")
+    interval = None
+    if duration is not None and lasting.any():
+        interval = float(np.median((duration / np.maximum(last - first, 1))[lasting]))
+    return Tracks(places, frames, particles, {name: values[owner] for name, values in table.items()}, interval)
 
 
 def read_labels(path: Path, shape: tuple[int, int, int]) -> Int[np.ndarray, "depth y x"]:

@@ -5,21 +5,22 @@ napari's own readers of OME-TIFF ignore the position of the first voxel, and tho
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from jaxtyping import Num
+from jaxtyping import Float, Num
 
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress
 from ..base.typing import Points
 from ..cli.options import CaptureOptions, depth_range, find_design, parse_depths
-from ..io.ngff import Series, display_range, read_series
+from ..io.ngff import Series, display_range, finished_frames, read_series
 from ..io.point_tables import POINTS_HEADER, read_points
 from ..io.provenance import DEVIATION, read_provenance
+from ..io.traces import TRACKS_HEADER, read_tracks
 from ..io.volumes import VOLUME_SUFFIXES, SurfaceMaps, read_surface, read_volume, surface_mesh
 from ..microscope.grid import Grid
 
@@ -185,6 +186,42 @@ def sample() -> list[Any]:
     return [(image, {"name": "beads", "contrast_limits": limits} | _capture_transform(imager.sensor), "image")]
 
 
+def frames_of(count: int, path: str | None) -> list[int]:
+    """Frames of a layer of a file that have a volume; of a recording that is not finished, some have none.
+
+    Raises `InputError` if there is none.
+    """
+    frames = list(range(count))
+    if path and read_series(path) is not None:
+        frames = [frame for frame in finished_frames(path) if frame < count]
+    if not frames:
+        raise InputError(f"{path}: must have volumes, got none that is finished.")
+    return frames
+
+
+def measure_points(
+    volumes: Any, frames: list[int], points: Float[np.ndarray, "point 3"]
+) -> Generator[int, None, dict[str, np.ndarray]]:
+    """Measures points as `gs-jax traces --from-points` does; returns signals `(frame, point)` by name.
+
+    Yields the number of frames that are done. `points` are in voxels `(z, y, x)` of `volumes`, `(t, z, y, x)`.
+
+    Raises `InputError` as the command.
+    """
+    from ..reconstruction.traces import RegionSignals, regions_of_points, relative_change
+
+    # Lengths are in voxels, as the layer may have no unit; depths must be above 0.
+    depth, *shape = volumes.shape[1:]
+    grid = Grid(1.0 + np.arange(depth), shape, 1.0, [(n - 1) / 2 for n in shape[::-1]])
+    regions = RegionSignals(regions_of_points(points[:, ::-1] + np.array([0, 0, 1]), grid))
+    rows = []
+    for row in regions.measure(volumes, frames):
+        rows.append(row)
+        yield len(rows)
+    means, backgrounds = (np.array(part) for part in zip(*rows, strict=True))
+    return {"mean": means, "background": backgrounds, "dff": relative_change(means - backgrounds)}
+
+
 Layer = tuple[Any, dict[str, Any], str]
 
 _AXES: dict[str, Any] = {"axis_labels": ("z", "y", "x"), "units": ("um", "um", "um")}
@@ -199,19 +236,30 @@ def reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | 
     suffix = Path(path).suffix.lower()
     if suffix in VOLUME_SUFFIXES:
         return _read_volume
-    return _read_points if suffix == ".csv" and _has_points(path) else None
+    return _table_reader(path) if suffix == ".csv" else None
 
 
-def _has_points(path: str) -> bool:
+def _table_reader(path: str) -> Callable[[Any], list[Layer]] | None:
     try:
         with open(path, encoding="utf-8-sig") as file:
-            return file.readline().startswith(POINTS_HEADER)
+            header = file.readline()
     except (OSError, UnicodeDecodeError):
-        return False
+        return None
+    readers = {POINTS_HEADER: _read_points, TRACKS_HEADER: _read_tracks}
+    return next((read for first, read in readers.items() if header.startswith(first)), None)
 
 
 def _read_points(path) -> list[Layer]:
     return [points_layer(read_points(path), Path(path).name)]
+
+
+def _read_tracks(path) -> list[Layer]:
+    """Lines from point to point of each particle."""
+    points, frames, particles, columns, interval = read_tracks(Path(path))
+    # napari takes the limits of colours without regard to NaN, which the speed of a single point is.
+    features = {name: np.nan_to_num(values) for name, values in columns.items()}
+    options = {"scale": (interval or 1.0, 1.0, 1.0, 1.0), "features": features, "name": Path(path).name}
+    return [(np.column_stack([particles, frames, _UM * points[:, 2::-1]]), options | _in_time(interval), "tracks")]
 
 
 def _read_volume(path) -> list[Layer]:
@@ -299,8 +347,11 @@ def _series_layer(series: Series, name: str) -> Layer:
         "translate": series.first,
         "contrast_limits": series.display,
         "name": name,
-        "axis_labels": ("t", *_AXES["axis_labels"]),
-        "units": ("s" if series.interval else "pixel", *_AXES["units"]),
         "multiscale": multiscale,
     }
-    return series.levels if multiscale else series.levels[0], options, "image"
+    return series.levels if multiscale else series.levels[0], options | _in_time(series.interval), "image"
+
+
+def _in_time(interval: float | None) -> dict[str, Any]:
+    axes, units = _AXES.values()
+    return {"axis_labels": ("t", *axes), "units": ("s" if interval else "pixel", *units)}
