@@ -312,8 +312,9 @@ def traces(viewer, recording):  # noqa: F811
     PluginManager.instance().discover()
     viewer.open(recording, plugin="gs-jax")
     made = Traces(viewer)
+    made.native.show()
     yield made
-    made.native.deleteLater()
+    made.native.hide()
 
 
 def plotted(traces, title: str) -> list[np.ndarray]:
@@ -332,7 +333,7 @@ def test_a_clicked_point_has_the_trace_that_the_command_writes(traces, viewer, f
     points.size = 60
     world = (0.0, *1000 * places[1, ::-1])
     viewer.dims.set_point((0, 1), (0.5, world[1]))
-    for title, table in (("Point 2 of p.csv: z 20200.0, y ", "p.csv"), ("Region: z 20200.0, y ", "one.csv")):
+    for title, table in (("Point 2 of p.csv\nz 20200.0, y ", "p.csv"), ("Region\nz 20200.0, y ", "one.csv")):
         assert run("traces", "v.zarr", "--from-points", table, "-o", "t.csv", "--force")[0] == 0
         rows = read_traces("t.csv")
         click(viewer, *world, dragged=9)
@@ -364,7 +365,7 @@ def test_points_of_a_frame_and_volumes_without_a_scale(traces, viewer):
     traces.reset_choices()
     viewer.dims.set_point((0, 1), (1, CELLS[0][0]))
     click(viewer, 1.0, *CELLS[0])
-    (mean, *_), label = plotted(traces, "Point 2 of cells: z 1.0, y 10.0, x 12.0 pixel"), "t, pixel"
+    (mean, *_), label = plotted(traces, "Point 2 of cells\nz 1.0, y 10.0, x 12.0 pixel"), "t, pixel"
     assert traces.figure.axes[1].get_xlabel() == label and mean[0].tolist() == [0, 1, 2, 3, 4]
     z, y, x = CELLS[0]
     inside = volumes[:, z, y - 1 : y + 2, x - 1 : x + 2].mean((1, 2))
@@ -389,6 +390,9 @@ def test_what_has_no_trace_is_one_line(traces, viewer):
     traces.reset_choices()
     click(viewer, 0.0, 20000.0, 0.0, 0.0)
     assert errors() == ["recording must be an open layer of volumes over time (t, z, y, x), got none."]
+    traces.native.hide()
+    click(viewer, 0.0, 20000.0, 0.0, 0.0)
+    assert errors() == []
 
 
 def test_tracks_lie_where_the_volume_is(viewer, tracks):  # noqa: F811

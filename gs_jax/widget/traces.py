@@ -3,6 +3,7 @@
 `napari.yaml` names it. The work runs in another thread.
 """
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -36,17 +37,21 @@ class Traces(Container):
         self.recording = ComboBox(label="Recording", choices=recordings, tooltip=tip)
         self.status = Label(label=" ", value="Click on a point, or in the volume.")
         super().__init__(widgets=[self.recording, self.status])
-        self.figure = Figure(layout="constrained")
+        self.figure = Figure(figsize=(4, 4), layout="constrained")
         self.canvas = FigureCanvasQTAgg(self.figure)
         for plot in (self.canvas, NavigationToolbar2QT(self.canvas, self.native)):
             self.native.layout().addWidget(plot)
         self.worker: Any = None
-        # Volumes, frames and places of the last measurement, and its signals.
-        self._measured: tuple[Any, Any] = ((None, None, None), {})
+        # Of the last measurement: the volumes, its frames and places, and the signals.
+        self._measured: Any = None
         self._now: list[Any] = []
         napari_viewer.mouse_drag_callbacks.append(self.click)
         napari_viewer.dims.events.point.connect(self._show_now)
-        self.native.destroyed.connect(self._close)
+
+    @property
+    def _is_closed(self) -> bool:
+        """Whether it is in no dock any more; napari and the viewer's callbacks keep it."""
+        return not (self.native.isVisible() or self.native.parent())
 
     def click(self, viewer, event):
         """Callback of napari for the mouse: plots the trace of where it is pressed and released without a drag."""
@@ -54,7 +59,7 @@ class Traces(Container):
         yield
         while event.type == "mouse_move":
             yield
-        if event.button == 1 and np.abs(event.pos - pressed).max() <= _CLICK:
+        if event.button == 1 and not self._is_closed and np.abs(event.pos - pressed).max() <= _CLICK:
             try:
                 self._start(*self._clicked(event))
             except InputError as error:
@@ -83,30 +88,35 @@ class Traces(Container):
         volumes, now = image.data[0] if image.multiscale else image.data, self.viewer.dims.point
         voxels = np.array([image.world_to_data([*now[: -len(place)], *place])[1:] for place in places])
         inside = (np.abs(voxels - np.clip(voxels, 0, np.subtract(volumes.shape[1:], 1))) <= 1).all(axis=1)
-        where = [
-            f"{axis} {at:.1f}" for axis, at in zip("zyx", image.data_to_world([0, *voxels[number]])[1:], strict=True)
-        ]
-        title = f"{name}: {', '.join(where)} {image.units[-1]:~}"
+        place = zip("zyx", image.data_to_world([0, *voxels[number]])[1:], strict=True)
+        where = f"{', '.join(f'{axis} {at:.1f}' for axis, at in place)} {image.units[-1]:~}"
         if not inside[number]:
-            raise input_error(name, f"within {image.name}", f"{', '.join(where)} {image.units[-1]:~}")
-        request = volumes, frames_of(volumes.shape[0], image.source.path), voxels[inside]
-        column = np.count_nonzero(inside[:number])
+            raise input_error(name, f"within {image.name}", where)
+        frames, near, column = frames_of(volumes.shape[0], image.source.path), voxels[inside], sum(inside[:number])
+        # A layer may go, and its volumes are not kept here.
+        measured = weakref.ref(volumes), frames, near
+        time, label = image.translate[0] + image.scale[0] * np.array(frames), f"t, {image.units[0]:~}"
+
+        def show(done: int) -> None:
+            self.status.value = f"Frame {done} of {len(frames)}"
+            if self._is_closed:
+                self.worker.quit()
 
         def finish(signals: dict[str, np.ndarray] | str) -> None:
             self.status.value = ""
             if isinstance(signals, str):
                 show_error(signals)
                 return
-            self._measured = request, signals
-            time = image.translate[0] + image.scale[0] * np.array(request[1])
-            self._draw(title, time, f"t, {image.units[0]:~}", {key: each[:, column] for key, each in signals.items()})
+            self._measured = *measured, signals
+            self._draw(f"{name}\n{where}", time, label, {key: each[:, column] for key, each in signals.items()})
 
-        before, signals = self._measured
-        if before[0] is volumes and before[1] == request[1] and np.array_equal(before[2], request[2]):
-            finish(signals)
-            return
-        self.worker = create_worker(_measure, *request, _start_thread=False)
-        self.worker.yielded.connect(lambda done: setattr(self.status, "value", f"Frame {done} of {len(request[1])}"))
+        if self._measured:
+            before, *request, signals = self._measured
+            if before() is volumes and request[0] == frames and np.array_equal(request[1], near):
+                finish(signals)
+                return
+        self.worker = create_worker(_measure, volumes, frames, near, _start_thread=False)
+        self.worker.yielded.connect(show)
         self.worker.returned.connect(finish)
         self.worker.start()
 
@@ -116,11 +126,11 @@ class Traces(Container):
         for name in ("mean", "background"):
             light.plot(time, signals[name], label=name)
         light.set_title(title, fontsize="medium")
-        light.legend(loc="upper right")
+        light.legend()
         change.plot(time, signals["dff"])
         change.set(xlabel=label, ylabel="dF/F")
         if not np.isfinite(signals["dff"]).any():
-            show_warning(f"{title}: the baseline is not above 0, and dF/F is nan")
+            show_warning(f"{title.splitlines()[0]}: the baseline is not above 0, and dF/F is nan")
         self._now = [axes.axvline(color="0.5", lw=1) for axes in (light, change)]
         self._show_now()
 
@@ -129,12 +139,6 @@ class Traces(Container):
         for line in self._now:
             line.set_xdata(self.viewer.dims.point[-4:-3])
         self.canvas.draw_idle()
-
-    def _close(self) -> None:
-        self.viewer.mouse_drag_callbacks.remove(self.click)
-        self.viewer.dims.events.point.disconnect(self._show_now)
-        if self.worker:
-            self.worker.quit()
 
 
 def _measure(volumes, frames, voxels):
