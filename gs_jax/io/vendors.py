@@ -85,4 +85,5 @@ def _open_hdf5(path: Path) -> Iterator[Source]:
 
 def _check_one(path: Path, names: Sequence[str]) -> None:
     if len(names) != 1:
-        raise InputError(f"{path}: must hold one image, got {len(names)}{names and f' ({listed(names)})' or ''}.")
+        several = f" ({listed(names)}); save the one that is meant in a file of its own" if names else ""
+        raise InputError(f"{path}: must hold one image, got {len(names)}{several}.")
