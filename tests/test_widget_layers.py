@@ -12,7 +12,10 @@ from gs_jax.base.progress import CancellableProgress, Cancelled
 from gs_jax.detection.particles import tracks_table
 from gs_jax.io.point_tables import write_points, write_rows
 from gs_jax.io.volumes import read_volume
-from gs_jax.widget.layers import Newest, newest_captures, prepare_layers, reader
+from gs_jax.reconstruction.traces import RegionSignals, regions_of_points, relative_change
+from gs_jax.widget.layers import Newest, measure_points, newest_captures, prepare_layers, reader
+
+from .test_traces import CELLS, GRID, LIGHT, blobs
 
 
 def test_the_newest_result_is_never_lost():
@@ -109,3 +112,18 @@ def test_tracks_without_their_points_are_one_line(tracks):
     other = tracks.rename(tracks.with_name("t.csv"))
     with pytest.raises(InputError, match="table of tracks must be named POINTS.csv.tracks.csv, got 't.csv'"):
         read(str(other))
+
+
+def test_points_in_voxels_are_measured_as_those_in_mm():
+    volumes, frames = np.stack([blobs(light) for light in LIGHT]), [0, 2, 4]
+    places = np.array(CELLS) + np.array([0.2, -0.1, 0.3])
+    steps = measure_points(volumes, frames, places)
+    assert [next(steps) for _ in frames] == [1, 2, 3]
+    with pytest.raises(StopIteration) as stop:
+        next(steps)
+    points = GRID.to_mm(np.array(CELLS)) + np.array([0.3 * 0.02, -0.1 * 0.02, 0.2])
+    regions = RegionSignals(regions_of_points(points, GRID))
+    means, backgrounds = map(np.array, zip(*(regions(volumes[frame]) for frame in frames), strict=True))
+    expected = {"mean": means, "background": backgrounds, "dff": relative_change(means - backgrounds)}
+    for name, values in stop.value.value.items():
+        np.testing.assert_array_equal(values, expected[name])
