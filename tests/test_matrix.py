@@ -276,7 +276,7 @@ def deviated(case: Case, _) -> None:
     sd, method = case.validation.deviation, METHODS["richardson-lucy"](10)
     volume = gs.reconstruct(case.of_truth, case.imager, case.grid, method, optics=case.optics)
     assert sd.shape == volume.shape and sd.dtype == np.float32 and (sd[volume > 0] > 0).all()
-    assert shares_within(volume, sd, case.truth)[1] > 0.66
+    assert shares_within(volume, sd, case.truth, case.imager, case.grid)[1] > 0.66
 
 
 def refocused(case: Case, _) -> None:

@@ -22,7 +22,7 @@ from gs_jax.optics.psf import psf_of_depth
 from gs_jax.reconstruction.inverse_problem import discrepancy_target, noise_variance, prepare_data, prepare_model
 from gs_jax.reconstruction.pipeline import METHODS, voxel_grid
 from gs_jax.reconstruction.radius_fit import _bounds, _middle, fit_radius, with_radii
-from gs_jax.reconstruction.residual import FLOOR, GAIN, folds_of_lenses, jackknife_deviation, kept_pixels_of_folds
+from gs_jax.reconstruction.residual import SHARE, folds_of_lenses, jackknife_deviation, kept_pixels_of_folds
 from gs_jax.simulation import simulate_volume
 from gs_jax.solvers.richardson_lucy import background_step, kl_divergence
 
@@ -507,5 +507,5 @@ def test_the_jackknife_is_the_deviation_of_a_mean():
     volumes = [np.delete(folds, fold, 0).mean(0).astype(np.float32) for fold in range(4)]
     deviation = np.sqrt(np.mean(jackknife_deviation(volumes) ** 2, (1, 2)))
     # What folds have in common is noise here, which is averaged over neighbours.
-    np.testing.assert_allclose(deviation / GAIN, [0.1 / 2, 0.3 / 2], rtol=0.05)
-    np.testing.assert_allclose(jackknife_deviation([np.full((2, 9, 9), 3, np.float32)] * 4), 3 * FLOOR, rtol=1e-6)
+    np.testing.assert_allclose(deviation, np.hypot(1, SHARE) * np.array([0.1, 0.3]) / 2, rtol=0.03)
+    np.testing.assert_allclose(jackknife_deviation([np.full((2, 9, 9), 3, np.float32)] * 4), 3 * SHARE, rtol=1e-6)
