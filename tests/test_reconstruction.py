@@ -503,9 +503,9 @@ def test_the_middle_keeps_its_place(radius, pitch, binning, margin):
 
 def test_the_jackknife_is_the_deviation_of_a_mean():
     """Of volumes that are means of all folds but one, whose noise is independent; dark but for the noise."""
-    folds = np.random.default_rng(0).normal(0, [[[[0.1]], [[0.3]]]], (4, 2, 120, 120))
+    folds = np.random.default_rng(0).normal(0, np.repeat([0.1, 0.3], 120), (4, 2, 120, 240))
     volumes = [np.delete(folds, fold, 0).mean(0).astype(np.float32) for fold in range(4)]
-    deviation = np.sqrt(np.mean(jackknife_deviation(volumes) ** 2, (1, 2)))
+    deviation = np.sqrt(np.mean(jackknife_deviation(volumes).reshape(2, 120, 2, 120) ** 2, (0, 1, 3)))
     # What folds have in common is noise here, which is averaged over neighbours.
     np.testing.assert_allclose(deviation, np.hypot(1, SHARE) * np.array([0.1, 0.3]) / 2, rtol=0.03)
     np.testing.assert_allclose(jackknife_deviation([np.full((2, 9, 9), 3, np.float32)] * 4), 3 * SHARE, rtol=1e-6)
