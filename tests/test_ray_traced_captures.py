@@ -36,7 +36,7 @@ def test_plain_back_projection_shows_ray_traced_points():
 
 
 def test_deviations_hold_for_ray_traced_scenes():
-    """Of kinds to which nothing was fitted, near 68 % of bright voxels are right within one, and 90 % within two."""
+    """Of scenes to which nothing was fitted, near 68 % of bright voxels are right within one, and 90 % within two."""
     settings = Settings((18.0, 22.0), field=2.6, rays=600, scale=2.0)
     with as_users_do("float32"):
         imager = cropped("geomscope").imager()
