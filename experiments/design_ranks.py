@@ -75,7 +75,7 @@ def random_design(specification: Specification, seed: int) -> Design:
     """A device on the same sensor and plate that could be made; its types are in focus, or nearly, over the depths."""
     start = start_of(specification)
     rng = np.random.default_rng([seed, *specification.start.encode()])
-    count, types = round(np.exp(rng.uniform(np.log(80), np.log(600)))), int(rng.choice([1, 3, 3, 5]))
+    count, types = round(np.exp(rng.uniform(np.log(80), np.log(300)))), int(rng.choice([1, 3, 3, 5]))
     distance = start.imaging.sensor_distance_mm * rng.uniform(0.75, 1.25)
     fill, focus = rng.uniform(0.35, 1.1), rng.uniform(0.97, 1.03)
     imager = start.replace(sensor_distance_mm=float(distance)).imager()
