@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gs_jax.base.errors import InputError
 from gs_jax.codesign.bound import EXPOSURES, _unexplained, bound_sheet, format_bound, lost_by_any
 from gs_jax.codesign.linear_error import FILL, Scene, _spectrum, directions, scene_of
 from gs_jax.design.design import read_design
@@ -91,11 +92,30 @@ def test_no_design_exceeds_it(name):
     assert (np.diff(own) > 0).all() and (np.diff(most) > 0).all()
 
 
+def test_finer_voxels_take_more_strips(monkeypatch):
+    imager, depths = SCOPE, np.array([18.0, 23.0])
+    with pytest.raises(InputError, match=r"needs voxels of at least 0\.\d+ um .*, got 0\.01 um"):
+        bound_sheet(imager, Conditions(depths, detail=1e-5))
+    found = []
+    monkeypatch.setattr(
+        "gs_jax.codesign.bound._at_exposures", lambda imager, at, exposures, strips: found.append(strips)
+    )
+    for detail in (0.04, 0.005):
+        with pytest.raises(AttributeError):
+            bound_sheet(imager, Conditions(depths, detail=detail))
+    assert found == [1024, 4096]
+
+
+def test_a_detail_is_that_of_the_bound(run):
+    status, _, err = run("metrics", "geomscope", "--detail-um", 20)
+    assert status == 2 and "--detail-um must be used with --bound." in err
+
+
 @pytest.mark.integration
 def test_the_command_says_a_designs_share(tmp_path, run):
-    status, out, _ = run("metrics", "endoscope", "--bound", "--json", tmp_path / "sheet.json")
+    status, out, _ = run("metrics", "endoscope", "--bound", "--detail-um", 16, "--json", tmp_path / "sheet.json")
     sheet = json.loads((tmp_path / "sheet.json").read_text())["bound"]
     assert status == 0 and format_bound(sheet, 7) in out
-    assert sheet["exposure"] == list(EXPOSURES)
+    assert sheet["exposure"] == list(EXPOSURES) and sheet["detail_um"] == 16
     shares = [round(100 * own / most) for own, most in zip(sheet["design_db"], sheet["most_db"], strict=True)]
     assert "the design has {} / {} / {} % of that".format(*shares) in out

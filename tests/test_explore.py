@@ -39,6 +39,8 @@ STUDY = Study.model_validate(
             {"name": "light_percent", "at_most": 1.0},
         ],
         "stages": [{"solver": "bfgs"}],
+        "exposure": 3000.0,
+        "detail_um": 16.0,
     }
 )
 MOVES = {"sensor_distance_mm": 6.1, "radius_of_curvature_mm": 2.2, "aperture_diameter_mm": 0.3}
@@ -112,6 +114,7 @@ def test_moves_compile_nothing(either):
 def test_targets_and_assumptions_in_words(design, monkeypatch):
     monkeypatch.setitem(TERMS, "light_percent", TERMS["light_percent"]._replace(random=True))
     start = start_of(design, STUDY)
+    assert (float(start.at.exposure), float(start.at.detail)) == pytest.approx((STUDY.exposure, STUDY.detail_um / 1000))
     moves = {"sensor_distance_mm": 7.0, "pitch_mm": 1.3 * make_sliders(design)["pitch_mm"].start}
     values = complete_values(make_sliders(design), moves)
     result = evaluate_design(start, values, explore_design.live_terms(STUDY))

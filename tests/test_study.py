@@ -48,6 +48,7 @@ def test_what_a_study_says(read):
     (term,), (stage,) = study.terms, study.stages
     assert (term.kind, term.target, term.weight, term.is_goal) == ("at_most", 0.5, 1.0, False)
     assert (stage.solver, stage.free, stage.terms) == ("bfgs", None, None)
+    assert study.scene == {"circle_of_confusion": None, "exposure": 1e4, "detail": 0.04}
 
 
 @pytest.mark.parametrize(

@@ -74,10 +74,10 @@ class Start(NamedTuple):
 
 
 def start_of(design: Design, study: Study | None = None) -> Start:
-    """The design as the start of all moves, with the study's circle of confusion."""
-    circle_of_confusion = None if study is None or study.confusion_um is None else study.confusion_um / 1000
-    circle_of_confusion = circle_of_confusion_of(design, circle_of_confusion)
-    return Start(*evaluated(design, depth_count=_DEPTHS, circle_of_confusion=circle_of_confusion))
+    """The design as the start of all moves, with the study's circle of confusion, exposure and detail."""
+    scene = {} if study is None else study.scene
+    scene |= {"circle_of_confusion": circle_of_confusion_of(design, scene.get("circle_of_confusion"))}
+    return Start(*evaluated(design, depth_count=_DEPTHS, **scene))
 
 
 def make_sliders(design: Design) -> dict[str, Slider]:

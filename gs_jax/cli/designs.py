@@ -80,7 +80,7 @@ def metrics_command(
     from ..objectives import Conditions
 
     if detail_um is not None and not bound:
-        raise InputError("--detail-um is the scenes' for --bound, which was not given.")
+        raise InputError("--detail-um must be used with --bound.")
     check_outputs(json, [".json"], inputs=(design,))
     circle_of_confusion = confusion_um and confusion_um / 1000
     microscope = light.read_design(design)
@@ -88,8 +88,8 @@ def metrics_command(
         check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
     if bound:
-        detail = 0.04 if detail_um is None else detail_um / 1000
-        sheet["bound"] = bound_sheet(microscope.imager(), Conditions(sheet["depth_mm"], detail=detail))
+        detail = {} if detail_um is None else {"detail": detail_um / 1000}
+        sheet["bound"] = bound_sheet(microscope.imager(), Conditions(sheet["depth_mm"], **detail))
     if json:
         write_json(json, sheet)
     click.echo(summary(microscope, sheet))

@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
+from ..base.errors import InputError
 from ..microscope.geometry import Imager
 from ..objectives.conditions import Conditions, Depths, as_conditions, finite_plate
 from .linear_error import (
@@ -48,9 +49,9 @@ from .linear_error import (
     views_and_spots,
 )
 
-# Strips of the plate across a direction, several for each of the 230 periods between planes at 15 and 30 mm under a
-# plate of 20 mm; and nodes along a strip.
-_STRIPS, _NODES = 1024, 8
+# Strips of the plate across a direction: several for each of the 230 periods of voxels of 40 um between planes at 15
+# and 30 mm under a plate of 20 mm. A datasheet has more where voxels are finer. And nodes along a strip.
+_STRIPS, _MOST, _NODES = 1024, 2**16, 8
 # Exposures of a datasheet: dim, usual, bright.
 EXPOSURES = (1e3, 1e4, 1e5)
 
@@ -68,11 +69,11 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     *Compiled.*
 
     Scenes are random planes at the depths, as wide as the plate, independent of each other, of objects with edges that
-    fill 3 %, on voxels of 40 um. The bound depends on the size of the plate, the depths, the object's medium, the
-    voxels and the exposure. Each ray that crosses the plate ends in at most one pixel, so no linear estimate from an
-    image is better than the best one from all rays, each known by its place and direction, with shot noise. Losses,
-    overlap and read noise are left out, and the number of pixels. Estimates with a positivity constraint may exceed it
-    for sparse scenes.
+    fill 3 %, on voxels of `Conditions.detail`, 40 um by default. The bound depends on the size of the plate, the
+    depths, the object's medium, the voxels and the exposure. Each ray that crosses the plate ends in at most one pixel,
+    so no linear estimate from an image is better than the best one from all rays, each known by its place and
+    direction, with shot noise. Losses, overlap and read noise are left out, and the number of pixels. Estimates with a
+    positivity constraint may exceed it for sparse scenes.
 
     Parameters
     ----------
@@ -99,21 +100,38 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     >>> print(f"{bound.design:.0f} of {bound.most:.0f} dB")
     19 of 28 dB
     """
-    at = as_conditions(imager, depths)
-    return VolumeBound(_gain(_lost_by_design(imager, at)), _gain(lost_by_any(imager, at)))
+    return _bounds(imager, as_conditions(imager, depths), _STRIPS)
+
+
+def _bounds(imager, at, strips) -> VolumeBound:
+    return VolumeBound(_gain(_lost_by_design(imager, at)), _gain(lost_by_any(imager, at, strips)))
 
 
 def bound_sheet(imager: Imager, depths: Depths) -> dict[str, Any]:
-    """`volume_bound` at three exposures, as numbers for a datasheet."""
+    """`volume_bound` at three exposures, as numbers for a datasheet.
+
+    Raises
+    ------
+    InputError
+        If voxels are much finer than the parallax of the depths under the plate.
+    """
     at = as_conditions(imager, depths)
-    gains = _at_exposures(imager, at, jnp.asarray(EXPOSURES, at.depths.dtype))
+    magnification = np.asarray(imager.magnification(at.depths))
+    parallax = float(np.ptp(magnification) / magnification.mean() * np.linalg.norm(np.asarray(finite_plate(imager))))
+    strips = _STRIPS
+    while 2 * strips * float(at.detail) < 4 * parallax:
+        strips *= 2
+    if strips > _MOST:
+        given, least = (f"{1000 * length:.3g} um" for length in (float(at.detail), 2 * parallax / _MOST))
+        raise InputError(f"The bound needs voxels of at least {least} for this plate and these depths, got {given}.")
+    gains = _at_exposures(imager, at, jnp.asarray(EXPOSURES, at.depths.dtype), strips)
     sheet = {"detail_um": round(1000 * float(at.detail), 3), "exposure": list(EXPOSURES)}
     return sheet | {"design_db": gains.design.tolist(), "most_db": gains.most.tolist()}
 
 
 @eqx.filter_jit
-def _at_exposures(imager, at, exposures) -> VolumeBound:
-    return jax.vmap(lambda exposure: volume_bound(imager, dataclasses.replace(at, exposure=exposure)))(exposures)
+def _at_exposures(imager, at, exposures, strips) -> VolumeBound:
+    return jax.vmap(lambda exposure: _bounds(imager, dataclasses.replace(at, exposure=exposure), strips))(exposures)
 
 
 def format_bound(sheet: dict[str, Any], planes: int) -> str:
@@ -160,8 +178,11 @@ def _alike_at_all_depths(views: View, reduced_depth: Float[Array, " depth"]) -> 
 
 
 @eqx.filter_jit
-def lost_by_any(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
-    """Share of each plane's power that every linear estimate leaves unexplained, whatever lenses are on the plate."""
+def lost_by_any(imager: Imager, at: Conditions, count: int = _STRIPS) -> Float[Array, " depth"]:
+    """Share of each plane's power that every linear estimate leaves unexplained, whatever lenses are on the plate.
+
+    `count`: of the strips into which the plate is divided.
+    """
     scene, away = scene_of(imager, at), imager.depth_in_medium(at.depths)
     half, magnification = finite_plate(imager) / 2, imager.magnification(at.depths)
     # Electrons of an emitter per mm^2 of the plate, times the squared distance.
@@ -169,7 +190,7 @@ def lost_by_any(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     spectrum = safe_sqrt(scene.spectrum) / away[:, None]
 
     def at_position(position):
-        strips = jax.vmap(lambda way: _strips(half, away, position, way))(directions(away.dtype).T)
+        strips = jax.vmap(lambda way: _strips(half, away, position, way, count))(directions(away.dtype).T)
         amplitude = safe_sqrt(light * strips.seen)[..., None, None] * spectrum[None, None]
         return _unexplained(scene, amplitude, 2 * jnp.pi * strips.along[..., None] * magnification[None, None])
 
@@ -183,7 +204,7 @@ class Strips(NamedTuple):
     seen: Float[Array, "*direction strip"]
 
 
-def _strips(half, away, position, way) -> Strips:
+def _strips(half, away, position, way, count) -> Strips:
     """Strips across a direction, which is parallel to no side; the cosine is the mean over the depths."""
     nodes, weights = (jnp.asarray(values, half.dtype) for values in np.polynomial.legendre.leggauss(_NODES))
     reach, across = jnp.abs(way) @ half, jnp.stack([-way[1], way[0]])
@@ -196,9 +217,9 @@ def _strips(half, away, position, way) -> Strips:
         points = way[None] * along + across[None] * ((low + high) / 2 + (high - low) / 2 * nodes)[:, None]
         offset = jnp.sum((points - position[None]) ** 2, 1)
         cosine = jnp.mean((1 + offset[:, None] / away[None] ** 2) ** -1.5, 1)
-        return Strips(along, jnp.maximum(high - low, 0) * reach / _STRIPS * jnp.sum(weights * cosine))
+        return Strips(along, jnp.maximum(high - low, 0) * reach / count * jnp.sum(weights * cosine))
 
-    return jax.vmap(strip)(jnp.asarray((np.arange(_STRIPS) + 0.5) / _STRIPS * 2 - 1, half.dtype))
+    return jax.vmap(strip)(jnp.asarray((np.arange(count) + 0.5) / count * 2 - 1, half.dtype))
 
 
 def _unexplained(scene: Scene, amplitude: Float[Array, "#direction view depth frequency"], turns):

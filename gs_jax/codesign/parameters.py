@@ -25,7 +25,7 @@ from ..design.tables import LENS_KEYS
 from ..io.toml import one_line
 from ..microscope.geometry import Imager
 from ..microscope.lenses import EACH
-from ..objectives.conditions import Conditions
+from ..objectives.conditions import DETAIL, Conditions
 from ..optics.apertures import pitch
 
 Values = dict[str, Float[Array, "..."]]
@@ -153,7 +153,7 @@ def evaluated(
     circle_of_confusion: float | None = None,
     depth_count: int = 6,
     exposure: float = 1e4,
-    detail: float = 0.04,
+    detail: float = DETAIL,
     free: Collection[str] = (),
 ) -> tuple[Imager, Conditions]:
     """The imager of a design and the conditions under which a search evaluates it.

@@ -83,10 +83,8 @@ class Problem(NamedTuple):
 def problem_of(design: Design, study: Study) -> Problem:
     """The problem that a study poses for a design; raises `InputError` as `check_design`."""
     check_design(design, study)
-    circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
-    where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
-    scene = {"exposure": study.exposure, "detail": study.detail_um / 1000}
-    return Problem(*evaluated(design, **where, **scene, free=study.free), study)
+    where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count}
+    return Problem(*evaluated(design, **where, **study.scene, free=study.free), study)
 
 
 @eqx.filter_jit

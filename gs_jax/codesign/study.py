@@ -34,6 +34,7 @@ from ..design.design import Design
 from ..io.toml import Table, one_line, read_toml
 from ..microscope.layouts import interleave
 from ..microscope.lenses import Orientation
+from ..objectives.conditions import DETAIL
 from .parameters import NAMES
 from .terms import GOALS, KINDS, check_term, current_name
 
@@ -184,7 +185,7 @@ class Study(Table):
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")
     exposure: Positive = Field(default=1e4, description="a positive number of electrons")
-    detail_um: Positive = Field(default=40.0, description="a positive number of micrometres")
+    detail_um: Positive = Field(default=1000 * DETAIL, description="a positive number of micrometres")
     margin: float = Field(default=0.005, ge=0, le=0.5, description="a number from 0 to 0.5")
     starts: int = Field(default=1, ge=1, le=10_000, description="a whole number from 1 to 10000")
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="a whole number from 0 to 2147483647")
@@ -192,6 +193,16 @@ class Study(Table):
     terms: tuple[TermTable, ...] = Field(strict=False, min_length=1, description="one or more tables")
     stages: tuple[StageTable, ...] = Field(strict=False, min_length=1, description="one or more tables")
     pareto: tuple[LimitTable, ...] = Field(default=(), strict=False, max_length=2, description="one or two tables")
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """What `evaluated` takes beside depths: circle of confusion, exposure and detail, mm and electrons."""
+        circle_of_confusion = None if self.confusion_um is None else self.confusion_um / 1000
+        return {
+            "circle_of_confusion": circle_of_confusion,
+            "exposure": self.exposure,
+            "detail": self.detail_um / 1000,
+        }
 
     @model_validator(mode="before")
     @classmethod

@@ -18,6 +18,8 @@ from ..base.errors import check_kind, input_error, short_repr
 from ..microscope.geometry import Imager
 from ..optics.apertures import clear_diameter as diameter_of, clear_diameters
 
+# Width of the paper's voxels, mm.
+DETAIL = 0.04
 # Heights over the field at which a lens is evaluated.
 _FIELDS = 4
 
@@ -61,7 +63,7 @@ class Conditions(eqx.Module):
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     circle_of_confusion: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     exposure: Float[Array, ""] = eqx.field(converter=as_float, default=1e4)
-    detail: Float[Array, ""] = eqx.field(converter=as_float, default=0.04)
+    detail: Float[Array, ""] = eqx.field(converter=as_float, default=DETAIL)
     directions: int = eqx.field(static=True, default=512)
     clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)

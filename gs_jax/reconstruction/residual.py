@@ -26,7 +26,8 @@ from .pipeline import BackProjection, Method, Reconstructor, check_call, check_s
 _REGIONS = 16
 # Voxels brighter than this share of the largest are those over which deviations are calibrated.
 BRIGHT = 0.1
-# Error that folds have in common, over the brightness: fitted to ray-traced letters, bars and a tilted sheet.
+# Error that folds have in common, over the brightness: fitted to ray-traced letters, bars and a tilted sheet, by
+# list-RL and Richardson-Lucy.
 SHARE = 1 / 3
 
 
