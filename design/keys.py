@@ -46,8 +46,8 @@ mirror = true                        # the list describes the other side of the 
 Columns `radius_of_curvature_mm`, `aperture_diameter_mm` and `conic_constant` hold a number for each lens, and replace
 the keys of these names in `[lens]`.
 
-Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel, x the column, y the row. `mirror` turns
-the plate over about its y axis, x to -x. `gs-jax calibrate` detects mirroring itself.
+Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel, x the column, y the row. `gs-jax calibrate`
+detects mirroring itself.
 
 ## Filters, windows and samples
 
@@ -79,8 +79,7 @@ def page() -> str:
         lines += ["| key | meaning | allowed |", "|---|---|---|"]
         lines += [_row(key) for key in shown]
         lines.append("")
-    lines.append(f"`[samples.NAME]`: {design_keys()['samples'].meaning}.\n")
-    lines.append(f"`[channels.NAME]`: {design_keys()['channels'].meaning}.\n")
+    
     lines.append(f"`[provenance]`: {design_keys()['provenance'].meaning}.")
     return "\n".join(lines) + "\n" + TAIL
 
