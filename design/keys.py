@@ -46,8 +46,8 @@ mirror = true                        # the list describes the other side of the 
 Columns `radius_of_curvature_mm`, `aperture_diameter_mm` and `conic_constant` hold a number for each lens, and replace
 the keys of these names in `[lens]`.
 
-Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel, x the column, y the row. `gs-jax calibrate`
-detects mirroring itself.
+Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel, x the column, y the row. `gs-jax
+calibrate` detects mirroring itself.
 
 ## Filters, windows and samples
 
