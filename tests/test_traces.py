@@ -89,6 +89,11 @@ def test_regions_of_points_by_distance():
     # Smaller than a voxel: the nearest voxel alone.
     tiny = regions_of_points(points, GRID, (1e-4, 1e-4))
     assert np.bincount(tiny.ravel()).tolist() == [tiny.size - 3, 1, 1, 1]
+    # Neighbouring planes count, whatever the rounding of their depths.
+    fine = gs.Grid(np.arange(18, 22.1, 0.2), (5, 5), 0.02)
+    for plane in range(1, len(fine.depths) - 1):
+        labels = regions_of_points(np.asarray(fine.to_mm(np.array([[plane, 2, 2]]))), fine)
+        assert np.flatnonzero(labels.any(axis=(1, 2))).tolist() == [plane - 1, plane, plane + 1]
     with pytest.raises(InputError, match="point 2 must be within the volume"):
         regions_of_points(points + [[0, 0, 0], [0, 0, 9], [0, 0, 0]], GRID, (0.1, 1.1))
     with pytest.raises(InputError, match="point 2 must have a voxel of its own"):

@@ -91,7 +91,8 @@ def traces_command(
     Options:
         regions: LABELS.tif or .zarr: a label image of the volume, or of a plane, for all planes, as napari's Labels.
         from_points: POINTS.csv: the voxels about each point of it.
-        radius_um: Half axes of these regions, laterally and along z. [default: 1.5 voxels and 1 plane]
+        radius_um: Half axes of these regions, laterally and along z. [default: 1.5 voxels and 1 plane,
+            with both neighbouring planes]
         segment: Segment the standard deviation of the frames, or their mean, by a threshold and a watershed; the
             regions are also written to TRACES.csv.labels.tif. [default: deviation, without --regions and
             --from-points]

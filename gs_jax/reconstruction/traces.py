@@ -28,6 +28,8 @@ _NO_REGION = "no region stands out of the volume; give --segment mean, --regions
 # Voxels about a region that belong to neither it nor its background, fewest voxels of its background, and the largest
 # distance of these.
 _GAP, _BACKGROUND, _FARTHEST = 1, 60, 12
+# Radius by which a voxel is within a region: the rounding of depths must not decide about a neighbouring plane.
+_WITHIN = 1 + 1e-4
 
 
 class SummaryVolumes:
@@ -78,8 +80,8 @@ def regions_of_points(
 ) -> Labels:
     """Give each point the voxels within a radius, lateral and axial, mm, that are nearer to it than to other points.
 
-    The radius is 1.5 voxels and 1 plane unless it is given. Regions have the numbers of the points, from 1. The voxel
-    that is nearest to a point is its own.
+    The radius is 1.5 voxels and 1 plane unless it is given; of a point in a plane, both neighbouring planes count.
+    Regions have the numbers of the points, from 1. The voxel that is nearest to a point is its own.
 
     Raises `InputError` if a point is outside the grid, or shares its voxel with another one.
     """
@@ -90,13 +92,13 @@ def regions_of_points(
     scaled = points[:, :3] / scale
     tree, labels = KDTree(scaled), np.zeros(grid.volume_shape, np.int32)
     planes, rows, columns = (
-        np.flatnonzero([np.abs(scaled[:, n] - at).min() <= 1 for at in axis / scale[n]])
+        np.flatnonzero([np.abs(scaled[:, n] - at).min() <= _WITHIN for at in axis / scale[n]])
         for n, axis in zip((2, 1, 0), axes, strict=True)
     )
     # Plane by plane, as the places of all voxels may need more memory than the volume.
     for plane in planes:
         places = np.stack(np.meshgrid(x[columns], y[rows], z[plane]), -1)[:, :, 0] / scale
-        nearest = tree.query(places, distance_upper_bound=1.0)[1]
+        nearest = tree.query(places, distance_upper_bound=_WITHIN)[1]
         labels[plane, rows[:, None], columns] = np.where(nearest < len(points), nearest + 1, 0)
     for number, point in enumerate(points, 1):
         index = tuple(int(np.abs(axis - at).argmin()) for axis, at in zip(axes, point[2::-1], strict=True))
