@@ -218,6 +218,7 @@ def test_grey_files_correct_a_channel(tmp_path, names):
     expected = STACK[0, 1] - 7.0
     expected[3, 4] = found.image[3, 4]
     np.testing.assert_array_equal(found.image, expected)
+    assert found.done[0] == f"channel {names[1]}"
     assert found.done[-1] == "1 bad pixel filled from neighbours: 1 in mask.tif"
     # A colour of a colour image is not corrected by a grey one.
     tifffile.imwrite(tmp_path / "rgb.tif", np.zeros((12, 14, 3), np.uint16), photometric="rgb")

@@ -95,12 +95,12 @@ class Readout(NamedTuple):
         x, y = (float(at - 0.5) * region.pixel_pitch + middle for at, middle in zip((x, y), cells.origin, strict=True))
         return Sensor(cells.shape, cells.pixel_pitch, (x, y))
 
-    def describe(self) -> list[str]:
-        """One line for each of channel, region and binning that is set."""
+    def describe(self, grey: bool = False) -> list[str]:
+        """One line for each of channel, region and binning that is set; `grey` as in `prepare`."""
         lines = []
         if self.channel:
             mosaic = f"the mosaic {self.bayer}, an image of its cells of 2 x 2 pixels"
-            is_colour = self.bayer or self.channel in CHANNELS
+            is_colour = self.bayer or (self.channel in CHANNELS and not grey)
             of = f" of {mosaic if self.bayer else 'a colour image'}"
             lines.append(f"{self.channel}{of}" if is_colour else f"channel {self.channel}")
         if self.roi:
@@ -237,7 +237,7 @@ def prepare(
     if correction.dark and correction.offset:
         raise InputError(f"--offset must not be given with --dark, got {correction.dark}; its offset is the dark's.")
     bad, bad_counts = np.zeros(size, bool), []
-    done, warnings = readout.describe(), []
+    done, warnings = readout.describe(grey), []
     dark, gain = correction.offset or None, None
 
     def read_like_capture(path: Path, page: str | None = REPEATS, dtypes: tuple[str, ...] = DTYPES) -> np.ndarray:
