@@ -100,18 +100,39 @@ def test_tracks_are_lines_in_um_with_durations_and_speeds(tracks):
     )
 
 
+def test_tracks_that_a_spreadsheet_saved(tracks):
+    """With a byte order mark, and sorted otherwise."""
+    read = reader(str(tracks))
+    assert read is not None
+    ((vertices, described, _),) = read(str(tracks))
+    header, *rows = tracks.read_text().splitlines()
+    tracks.write_text("\n".join([header, *rows[::-1], ""]), encoding="utf-8-sig")
+    ((again, same, _),) = read(str(tracks))
+    np.testing.assert_array_equal(again, vertices)
+    for name, values in described["features"].items():
+        np.testing.assert_array_equal(same["features"][name], values)
+
+
 def test_tracks_without_their_points_are_one_line(tracks):
     read, beside = reader(str(tracks)), tracks.with_name("p.csv")
     assert read is not None
+    write_points(beside, np.ones((2, 4)), {"particle": np.array([4, 4])})
+    with pytest.raises(InputError, match="p.csv: must be a table of points by .*--track`, got no column frame"):
+        read(str(tracks))
     write_points(beside, np.ones((2, 4)), {"frame": np.array([0, 1]), "particle": np.array([4, 4])})
     with pytest.raises(InputError, match="tracks.csv: must have the particles of p.csv"):
         read(str(tracks))
     beside.unlink()
     with pytest.raises(InputError, match="p.csv: cannot be read"):
         read(str(tracks))
-    other = tracks.rename(tracks.with_name("t.csv"))
-    with pytest.raises(InputError, match="table of tracks must be named POINTS.csv.tracks.csv, got 't.csv'"):
-        read(str(other))
+    for name in ("t.csv", ".tracks.csv"):
+        tracks = tracks.rename(tracks.with_name(name))
+        with pytest.raises(InputError, match=f"table of tracks must be named POINTS.csv.tracks.csv, got '{name}'"):
+            read(str(tracks))
+    tracks = tracks.rename(tracks.with_name("p.csv.tracks.csv"))
+    tracks.write_text(tracks.read_text().replace("last_frame", "last"))
+    with pytest.raises(InputError, match="tracks.csv: must be a table of tracks, got no column last_frame"):
+        read(str(tracks))
 
 
 def test_points_in_voxels_are_measured_as_those_in_mm():

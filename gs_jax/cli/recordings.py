@@ -73,7 +73,9 @@ class RecordingOptions(OptionGroup):
 
     def track_files(self, points: Path) -> list[Path]:
         """The table of tracks and its picture beside a table of points, if particles are followed."""
-        return [side_file(points, f".tracks{suffix}") for suffix in (".csv", ".png") if self.track]
+        from ..io.traces import TRACKS_SUFFIXES
+
+        return [side_file(points, suffix) for suffix in TRACKS_SUFFIXES if self.track]
 
 
 @dataclass

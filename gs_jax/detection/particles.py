@@ -14,6 +14,7 @@ from skimage.measure import label, regionprops
 
 from ..base.errors import InputError, needs_extra
 from ..base.typing import Number
+from ..io.traces import TRACKS_HEADER
 from ..microscope.grid import Grid
 
 # Standard deviation of a normal distribution over its median absolute deviation.
@@ -181,7 +182,7 @@ def tracks_table(
     # Of each step, the track that it belongs to.
     of_track = owner[1:][np.diff(particles) == 0]
     duration = (frames[last] - frames[first]) * (interval or 1.0)
-    table = {"particle": numbers, "points": counts, "first_frame": frames[first], "last_frame": frames[last]}
+    table = dict(zip(TRACKS_HEADER.split(","), (numbers, counts, frames[first], frames[last]), strict=True))
     table["duration_s" if interval else "duration_frames"] = duration
     for name, axes in (("", 3), ("lateral_", 2)):
         path = np.bincount(of_track, np.linalg.norm(steps[:, :axes], axis=1), len(numbers))

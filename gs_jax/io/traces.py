@@ -4,7 +4,7 @@ Also label images, and tables of tracks.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +23,8 @@ from .recordings import zarr_image
 TRACE_SUFFIXES = (".csv", ".h5")
 # Columns that every table of traces has.
 _NEEDED = ("region", "frame", "x_mm", "y_mm", "z_mm", "dff")
-# First columns of a table of tracks, whose name is that of its points and this.
-TRACKS_HEADER, TRACKS_SUFFIX = "particle,points,first_frame,last_frame", ".tracks.csv"
+# First columns of a table of tracks, and what the names of this and of its picture add to that of the points.
+TRACKS_HEADER, TRACKS_SUFFIXES = "particle,points,first_frame,last_frame", (".tracks.csv", ".tracks.png")
 # F, of which a table has one or more.
 SIGNALS = ("demixed", "intensity", "mean")
 
@@ -60,8 +60,7 @@ def read_traces(path: PathLike) -> dict[str, np.ndarray]:
                 columns = {name: np.asarray(file[name]) for name in file}
         else:
             columns = _read_csv(path)
-    if missing := [name for name in _NEEDED if name not in columns]:
-        raise InputError(f"{path}: must be a table of `gs-jax traces`, got no column {missing[0]}.")
+    _check_columns(path, "table of `gs-jax traces`", columns, _NEEDED)
     if len({values.shape for values in columns.values()}) > 1 or columns["dff"].ndim != 1 or not len(columns["dff"]):
         raise InputError(f"{path}: must be a table of `gs-jax traces`, with rows, and columns of one length.")
     if not np.isfinite(columns["dff"]).any() and not any(name in columns for name in SIGNALS):
@@ -71,8 +70,13 @@ def read_traces(path: PathLike) -> dict[str, np.ndarray]:
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     """Columns by name, which may have NaN."""
-    rows = np.genfromtxt(path, delimiter=",", names=True, dtype=float, ndmin=1, encoding="utf-8")
+    rows = np.genfromtxt(path, delimiter=",", names=True, dtype=float, ndmin=1, encoding="utf-8-sig")
     return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def _check_columns(path: Path, kind: str, columns: Iterable[str], needed: Iterable[str]) -> None:
+    if missing := [name for name in needed if name not in columns]:
+        raise InputError(f"{path}: must be a {kind}, got no column {missing[0]}.")
 
 
 class Tracks(NamedTuple):
@@ -90,14 +94,20 @@ def read_tracks(path: Path) -> Tracks:
 
     Raises `InputError` if one of them cannot be read, is another table, or lacks particles of the other.
     """
-    if not path.name.endswith(TRACKS_SUFFIX):
-        raise input_error("table of tracks", f"named POINTS.csv{TRACKS_SUFFIX}", short_repr(path.name))
+    suffix, header = TRACKS_SUFFIXES[0], TRACKS_HEADER.split(",")
+    if (name := path.name.removesuffix(suffix)) in ("", path.name):
+        raise input_error("table of tracks", f"named POINTS.csv{suffix}", short_repr(path.name))
     with decoding(check_input(path), "table of tracks"):
         table = _read_csv(path)
-        number, points, first, last = (table.pop(name) for name in TRACKS_HEADER.split(","))
-    beside = path.with_name(path.name.removesuffix(TRACKS_SUFFIX))
+    _check_columns(path, "table of tracks", table, header)
+    # A spreadsheet may have sorted them otherwise.
+    order = np.argsort(table["particle"])
+    table = {name: values[order] for name, values in table.items()}
+    number, points, first, last = (table.pop(name) for name in header)
+    beside = path.with_name(name)
     places, more = read_point_columns(beside)
-    frames, particles = (more.get(name, np.zeros(0)).astype(int) for name in ("frame", "particle"))
+    _check_columns(beside, "table of points by `gs-jax reconstruct --track`", more, ("frame", "particle"))
+    frames, particles = (more[name].astype(int) for name in ("frame", "particle"))
     found, owner, counts = np.unique(particles, return_inverse=True, return_counts=True)
     if not len(found) or not (np.array_equal(found, number) and np.array_equal(counts, points)):
         raise InputError(f"{path}: must have the particles of {beside.name}, and there must be some.")
