@@ -354,6 +354,10 @@ def test_a_clicked_point_has_the_trace_that_the_command_writes(traces, viewer, f
         click(viewer, 0.0, *1000 * places[number - 1, ::-1])
         plotted(traces, f"Point {number} of p.csv")
     assert traces.worker is worker and errors() == []
+    # Without the recording there is no frame to mark.
+    viewer.layers.clear()
+    traces.canvas.draw()
+    assert not traces.figure.axes[1].lines[1].get_visible()
 
 
 def test_points_of_a_frame_and_volumes_without_a_scale(traces, viewer):
@@ -368,8 +372,12 @@ def test_points_of_a_frame_and_volumes_without_a_scale(traces, viewer):
     (mean, *_), label = plotted(traces, "Point 2 of cells\nz 1.0, y 10.0, x 12.0 pixel"), "t, pixel"
     assert traces.figure.axes[1].get_xlabel() == label and mean[0].tolist() == [0, 1, 2, 3, 4]
     z, y, x = CELLS[0]
-    inside = volumes[:, z, y - 1 : y + 2, x - 1 : x + 2].mean((1, 2))
-    np.testing.assert_allclose(mean[1], inside, rtol=1e-6)
+    inside = [
+        *volumes[:, z, y - 1 : y + 2, x - 1 : x + 2].reshape(5, 9).T,
+        volumes[:, z - 1, y, x],
+        volumes[:, z + 1, y, x],
+    ]
+    np.testing.assert_allclose(mean[1], np.mean(inside, 0), rtol=1e-6)
 
 
 def test_what_has_no_trace_is_one_line(traces, viewer):
@@ -380,19 +388,48 @@ def test_what_has_no_trace_is_one_line(traces, viewer):
     click(viewer, 0.0, 20000.0, 0.0, 100.0)
     assert errors() == ["click in 3-D must be on a point, got none there."]
     viewer.dims.ndisplay = 2
-    place = [20000.0, 0.0, 100.0]
-    viewer.add_points([place, place], size=100, units=("um",) * 3, axis_labels=tuple("zyx"))
+    place, far = [20000.0, 0.0, 100.0], [20000.0, 9000.0, 0.0]
+    viewer.add_points([far, far, place, place], size=100, units=("um",) * 3, axis_labels=tuple("zyx"))
     click(viewer, 0.0, *place)
     found = []
     wait(lambda: found.extend(errors()) or found)
-    assert re.fullmatch("point . must have a voxel of its own, got one that is nearer to another point.", *found)
+    assert re.fullmatch("point [34] must have a voxel of its own, got one that is nearer to another point.", *found)
     viewer.layers.clear()
+    viewer.add_image(np.zeros((2, 2, 4, 4, 3), np.uint8), rgb=True)
     traces.reset_choices()
     click(viewer, 0.0, 20000.0, 0.0, 0.0)
     assert errors() == ["recording must be an open layer of volumes over time (t, z, y, x), got none."]
     traces.native.hide()
     click(viewer, 0.0, 20000.0, 0.0, 0.0)
-    assert errors() == []
+    assert errors() == [] and traces.click not in viewer.mouse_drag_callbacks
+
+
+def test_a_later_click_stops_a_measurement_unless_it_has_no_trace(traces, viewer, monkeypatch):
+    """What comes late from the earlier one is ignored; what cannot be read is one line."""
+    goes_on = threading.Event()
+
+    def measure(*_):
+        yield 1
+        assert goes_on.wait(_LONGEST)
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr("gs_jax.widget.traces.measure_points", measure)
+    viewer.dims.set_point(1, 20000)
+    click(viewer, 0.0, 20000.0, 0.0, 100.0)
+    wait(lambda: traces.status.value == "Frame 1 of 4")
+    earlier = traces.worker
+    click(viewer, 0.0, 20000.0, 9000.0, 0.0)
+    assert len(errors()) == 1 and traces.worker is earlier and not earlier.abort_requested
+    click(viewer, 0.0, 20000.0, 0.0, 120.0)
+    assert traces.worker is not earlier and earlier.abort_requested
+    earlier.yielded.emit(9)
+    earlier.returned.emit("late")
+    assert "9" not in traces.status.value and errors() == []
+    goes_on.set()
+    found = []
+    wait(lambda: found.extend(errors()) or found)
+    assert found == ["v.zarr: the disk is gone"]
+    wait(lambda: not traces.status.value)
 
 
 def test_tracks_lie_where_the_volume_is(viewer, tracks):  # noqa: F811

@@ -170,7 +170,7 @@ def _of_volumes(source: Path, regions, from_points, radius, summary: str, progre
     """Regions of volumes and their means, in two passes over the frames."""
     import numpy as np
 
-    from ..io.ngff import finished_frames, read_series, series_grid
+    from ..io.ngff import frames_of, read_series, series_grid
     from ..io.point_tables import read_scene_points
     from ..io.traces import read_labels
     from ..reconstruction import traces
@@ -178,9 +178,8 @@ def _of_volumes(source: Path, regions, from_points, radius, summary: str, progre
     series = read_series(source)
     if series is None or series.levels[0].ndim != 4:
         raise InputError(f"{source}: must be VOLUME.zarr of a recording by gs-jax reconstruct, or POINTS.csv.")
-    volumes, grid, frames = series.levels[0], series_grid(series), finished_frames(source)
-    if not frames:
-        raise InputError(f"{source}: must have volumes, got none that is finished.")
+    volumes, grid = series.levels[0], series_grid(series)
+    frames = frames_of(volumes.shape[0], source)
     shape = grid.volume_shape
     labels = read_labels(regions, shape) if regions else None
     if from_points:

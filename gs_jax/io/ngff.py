@@ -442,9 +442,16 @@ def series_grid(series: Series) -> Grid:
     return Grid([round(depth + index * step, 9) for index in range(z)], (y, x), pitch, origin[::-1])
 
 
-def finished_frames(path: PathLike) -> list[int]:
-    """Frames of what `VolumeSeries` wrote that have a volume, in their order; the others read as zeros."""
-    return sorted(_finished(Path(path)))
+def frames_of(count: int, path: PathLike | None) -> list[int]:
+    """Numbers of the first `count` frames that have a volume; others of what `VolumeSeries` wrote read as zeros.
+
+    Raises `InputError` if there is none.
+    """
+    is_series = path and _read_head(path) is not None
+    frames = [frame for frame in sorted(_finished(Path(path))) if frame < count] if is_series else list(range(count))
+    if not frames:
+        raise InputError(f"{path or 'recording'}: must have volumes, got none that is finished.")
+    return frames
 
 
 def check_replaceable(path: Path, otherwise: str = "--force to replace it") -> None:

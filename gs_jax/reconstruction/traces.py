@@ -76,15 +76,20 @@ def segment(volume: Volume) -> Labels:
 
 
 def regions_of_points(
-    points: Float[np.ndarray, "point _"], grid: Grid, radius: tuple[float, float] | None = None
+    points: Float[np.ndarray, "point _"],
+    grid: Grid,
+    radius: tuple[float, float] | None = None,
+    numbers: Int[np.ndarray, " point"] | None = None,
 ) -> Labels:
     """Give each point the voxels within a radius, lateral and axial, mm, that are nearer to it than to other points.
 
     The radius is 1.5 voxels and 1 plane unless it is given; of a point in a plane, both neighbouring planes count.
     Regions have the numbers of the points, from 1. The voxel that is nearest to a point is its own.
 
-    Raises `InputError` if a point is outside the grid, or shares its voxel with another one.
+    Raises `InputError` if a point is outside the grid, or shares its voxel with another one; it names the point by its
+    number in `numbers`, by default from 1.
     """
+    names = np.arange(1, len(points) + 1) if numbers is None else numbers
     axes = z, y, x = [np.asarray(axis, np.float64) for axis in (grid.depths, grid.y, grid.x)]
     step = [np.ptp(axis) / max(len(axis) - 1, 1) or math.inf for axis in axes]
     lateral, axial = radius or (1.5 * grid.pitch, step[0] if len(z) > 1 else grid.pitch)
@@ -104,12 +109,14 @@ def regions_of_points(
         index = tuple(int(np.abs(axis - at).argmin()) for axis, at in zip(axes, point[2::-1], strict=True))
         away = [abs(axis[i] - at) for axis, i, at in zip(axes, index, point[2::-1], strict=True)]
         if any(distance > side for distance, side in zip(away, step, strict=True)):
-            raise InputError(f"point {number} must be within the volume, got {np.round(point[:3], 4).tolist()} mm.")
+            place = np.round(point[:3], 4).tolist()
+            raise InputError(f"point {names[number - 1]} must be within the volume, got {place} mm.")
         if tree.query(np.array([x[index[2]], y[index[1]], z[index[0]]]) / scale)[1] == number - 1:
             labels[index] = number
     missing = np.setdiff1d(np.arange(1, len(points) + 1), labels)
     if len(missing):
-        raise InputError(f"point {missing[0]} must have a voxel of its own, got one that is nearer to another point.")
+        name = names[missing[0] - 1]
+        raise InputError(f"point {name} must have a voxel of its own, got one that is nearer to another point.")
     return labels
 
 

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Int, Num
 
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress
 from ..base.typing import Points
 from ..cli.options import CaptureOptions, depth_range, find_design, parse_depths
-from ..io.ngff import Series, display_range, finished_frames, read_series
+from ..io.ngff import Series, display_range, read_series
 from ..io.point_tables import POINTS_HEADER, read_points
 from ..io.provenance import DEVIATION, read_provenance
 from ..io.traces import TRACKS_HEADER, read_tracks
@@ -186,25 +186,16 @@ def sample() -> list[Any]:
     return [(image, {"name": "beads", "contrast_limits": limits} | _capture_transform(imager.sensor), "image")]
 
 
-def frames_of(count: int, path: str | None) -> list[int]:
-    """Frames of a layer of a file that have a volume; of a recording that is not finished, some have none.
-
-    Raises `InputError` if there is none.
-    """
-    frames = list(range(count))
-    if path and read_series(path) is not None:
-        frames = [frame for frame in finished_frames(path) if frame < count]
-    if not frames:
-        raise InputError(f"{path}: must have volumes, got none that is finished.")
-    return frames
-
-
 def measure_points(
-    volumes: Any, frames: list[int], points: Float[np.ndarray, "point 3"]
+    volumes: Any,
+    frames: list[int],
+    points: Float[np.ndarray, "point 3"],
+    numbers: Int[np.ndarray, " point"] | None = None,
 ) -> Generator[int, None, dict[str, np.ndarray]]:
     """Measures points as `gs-jax traces --from-points` does; returns signals `(frame, point)` by name.
 
-    Yields the number of frames that are done. `points` are in voxels `(z, y, x)` of `volumes`, `(t, z, y, x)`.
+    Yields the number of frames that are done. `points` are in voxels `(z, y, x)` of `volumes`, `(t, z, y, x)`, and
+    errors name their `numbers`, by default from 1.
 
     Raises `InputError` as the command.
     """
@@ -213,7 +204,7 @@ def measure_points(
     # Lengths are in voxels, as the layer may have no unit; depths must be above 0.
     depth, *shape = volumes.shape[1:]
     grid = Grid(1.0 + np.arange(depth), shape, 1.0, [(n - 1) / 2 for n in shape[::-1]])
-    regions = RegionSignals(regions_of_points(points[:, ::-1] + np.array([0, 0, 1]), grid))
+    regions = RegionSignals(regions_of_points(points[:, ::-1] + np.array([0, 0, 1]), grid, numbers=numbers))
     rows = []
     for row in regions.measure(volumes, frames):
         rows.append(row)
@@ -353,5 +344,5 @@ def _series_layer(series: Series, name: str) -> Layer:
 
 
 def _in_time(interval: float | None) -> dict[str, Any]:
-    axes, units = _AXES.values()
-    return {"axis_labels": ("t", *axes), "units": ("s" if interval else "pixel", *units)}
+    time = {"axis_labels": "t", "units": "s" if interval else "pixel"}
+    return {name: (time[name], *space) for name, space in _AXES.items()}
