@@ -79,7 +79,7 @@ def page() -> str:
         lines += ["| key | meaning | allowed |", "|---|---|---|"]
         lines += [_row(key) for key in shown]
         lines.append("")
-    
+
     lines.append(f"`[provenance]`: {design_keys()['provenance'].meaning}.")
     return "\n".join(lines) + "\n" + TAIL
 

@@ -413,7 +413,7 @@ def width_per_light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """`spot_width` over the fourth root of the percentage of light that all lenses collect: sharpness and noise in one.
 
     In mm, as `spot_width` where the lenses collect 1 %. It ranks designs as Richardson-Lucy at equal exposure does
-    (`experiments/design_ranks.py`).
+    (`experiments/results/codesign.md`).
     """
     return _per_light(spot_width(imager, depths), light(imager, depths))
 
