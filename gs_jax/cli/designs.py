@@ -77,7 +77,7 @@ def metrics_command(
     from ..codesign.bound import bound_sheet, format_bound
     from ..design.datasheets import datasheet, findings, overview, summary, tables
     from ..microscope.geometry import check_beyond
-    from ..objectives import Conditions
+    from ..objectives.conditions import DETAIL, Conditions
 
     if detail_um is not None and not bound:
         raise InputError("--detail-um must be used with --bound.")
@@ -88,8 +88,8 @@ def metrics_command(
         check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
     if bound:
-        detail = {} if detail_um is None else {"detail": detail_um / 1000}
-        sheet["bound"] = bound_sheet(microscope.imager(), Conditions(sheet["depth_mm"], **detail))
+        detail = DETAIL if detail_um is None else detail_um / 1000
+        sheet["bound"] = bound_sheet(microscope.imager(), Conditions(sheet["depth_mm"], detail=detail))
     if json:
         write_json(json, sheet)
     click.echo(summary(microscope, sheet))

@@ -447,8 +447,10 @@ def frames_of(count: int, path: PathLike | None) -> list[int]:
 
     Raises `InputError` if there is none.
     """
-    is_series = path and _read_head(path) is not None
-    frames = [frame for frame in sorted(_finished(Path(path))) if frame < count] if is_series else list(range(count))
+    if path is None or _read_head(path) is None:
+        frames = list(range(count))
+    else:
+        frames = [frame for frame in sorted(_finished(Path(path))) if frame < count]
     if not frames:
         raise InputError(f"{path or 'recording'}: must have volumes, got none that is finished.")
     return frames
