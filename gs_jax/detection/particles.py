@@ -182,9 +182,8 @@ def tracks_table(
     # Of each step, the track that it belongs to.
     of_track = owner[1:][np.diff(particles) == 0]
     duration = (frames[last] - frames[first]) * (interval or 1.0)
-    table: dict[str, np.ndarray] = dict(
-        zip(TRACKS_HEADER.split(","), (numbers, counts, frames[first], frames[last]), strict=True)
-    )
+    leading = numbers, counts, frames[first], frames[last]
+    table: dict[str, np.ndarray] = dict(zip(TRACKS_HEADER.split(","), leading, strict=True))
     table["duration_s" if interval else "duration_frames"] = duration
     for name, axes in (("", 3), ("lateral_", 2)):
         path = np.bincount(of_track, np.linalg.norm(steps[:, :axes], axis=1), len(numbers))

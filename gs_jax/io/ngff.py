@@ -447,9 +447,8 @@ def frames_of(count: int, path: PathLike | None) -> list[int]:
 
     Raises `InputError` if there is none.
     """
-    if path is None or _read_head(path) is None:
-        frames = list(range(count))
-    else:
+    frames = list(range(count))
+    if path and _read_head(path) is not None:
         frames = [frame for frame in sorted(_finished(Path(path))) if frame < count]
     if not frames:
         raise InputError(f"{path or 'recording'}: must have volumes, got none that is finished.")
