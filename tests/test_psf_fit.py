@@ -52,6 +52,7 @@ def test_derivatives_of_the_warp():
     check_grads(value, arguments, order=1, modes=["fwd", "rev"], eps=1e-6, rtol=1e-5)
 
 
+@pytest.mark.integration
 def test_a_wrong_scale_is_found():
     """Four fifths of what held-out pixels lose come back; a PSF that fits hardly changes."""
     image = capture(0.002)

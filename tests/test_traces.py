@@ -292,6 +292,7 @@ def test_traces_of_particles(folder, run):
     assert table["y_mm"].tolist() == [0, 0, 0, 0.1] and table["intensity"].tolist() == [4, 8, 5, 5]
 
 
+@pytest.mark.integration
 def test_traces_of_captures(folder, run, images):
     """Points without a volume, and the regions of a volume; the report has the table."""
     np.save("frames.npy", frames_of(images).astype(np.float32))
