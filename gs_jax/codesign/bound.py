@@ -50,7 +50,7 @@ from .linear_error import (
 )
 
 # Strips of the plate across a direction: several for each of the 230 periods of voxels of 40 um between planes at 15
-# and 30 mm under a plate of 20 mm. A datasheet has more where voxels are finer. And nodes along a strip.
+# and 30 mm under a plate of 20 mm, more where voxels are finer, up to a limit; and nodes along a strip.
 _STRIPS, _MOST, _NODES = 1024, 2**16, 8
 # Exposures of a datasheet: dim, usual, bright.
 EXPOSURES = (1e3, 1e4, 1e5)
@@ -91,7 +91,7 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     Raises
     ------
     ValueError
-        If the plate has no size.
+        If the plate has no size, or voxels are much finer than the parallax of the depths under the plate.
 
     Examples
     --------
@@ -100,22 +100,12 @@ def volume_bound(imager: Imager, depths: Depths) -> VolumeBound:
     >>> print(f"{bound.design:.0f} of {bound.most:.0f} dB")
     19 of 28 dB
     """
-    return _bounds(imager, as_conditions(imager, depths), _STRIPS)
-
-
-def _bounds(imager, at, strips) -> VolumeBound:
-    return VolumeBound(_gain(_lost_by_design(imager, at)), _gain(lost_by_any(imager, at, strips)))
-
-
-def bound_sheet(imager: Imager, depths: Depths) -> dict[str, Any]:
-    """`volume_bound` at three exposures, as numbers for a datasheet.
-
-    Raises
-    ------
-    InputError
-        If voxels are much finer than the parallax of the depths under the plate.
-    """
     at = as_conditions(imager, depths)
+    return _bounds(imager, at, _strip_count(imager, at))
+
+
+def _strip_count(imager: Imager, at: Conditions) -> int:
+    """Strips of the plate, four or more for each period of the finest detail; raises `InputError` if too many."""
     magnification = np.asarray(imager.magnification(at.depths))
     parallax = float(np.ptp(magnification) / magnification.mean() * np.linalg.norm(np.asarray(finite_plate(imager))))
     strips = _STRIPS
@@ -124,7 +114,17 @@ def bound_sheet(imager: Imager, depths: Depths) -> dict[str, Any]:
     if strips > _MOST:
         given, least = (f"{1000 * length:.3g} um" for length in (float(at.detail), 2 * parallax / _MOST))
         raise InputError(f"The bound needs voxels of at least {least} for this plate and these depths, got {given}.")
-    gains = _at_exposures(imager, at, jnp.asarray(EXPOSURES, at.depths.dtype), strips)
+    return strips
+
+
+def _bounds(imager, at, strips) -> VolumeBound:
+    return VolumeBound(_gain(_lost_by_design(imager, at)), _gain(lost_by_any(imager, at, strips)))
+
+
+def bound_sheet(imager: Imager, depths: Depths) -> dict[str, Any]:
+    """`volume_bound` at three exposures, as numbers for a datasheet; raises what it does."""
+    at = as_conditions(imager, depths)
+    gains = _at_exposures(imager, at, jnp.asarray(EXPOSURES, at.depths.dtype), _strip_count(imager, at))
     sheet = {"detail_um": round(1000 * float(at.detail), 3), "exposure": list(EXPOSURES)}
     return sheet | {"design_db": gains.design.tolist(), "most_db": gains.most.tolist()}
 
