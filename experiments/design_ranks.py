@@ -7,8 +7,8 @@ brightest pixel of the rule of thumb. A design counts with the mean gain over an
 
     python -m experiments.design_ranks [--seeds 7] [--records FOLDER] [--out DIR]
 
-Writes the records after each scene, from which the next run goes on, and then `design_ranks.md`; two to four minutes of
-a core for each design.
+Writes the records after each scene, from which the next run goes on, and then `design_ranks.md`; three to fifteen
+minutes of a core for each design.
 """
 
 from collections.abc import Callable, Sequence
